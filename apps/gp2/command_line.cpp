@@ -3,11 +3,13 @@
 #include <algorithm>
 #include <charconv>
 #include <cstdint>
+#include <limits>
 #include <map>
 #include <memory>
 #include <optional>
 #include <regex>
 #include <system_error>
+#include <type_traits>
 #include <utility>
 #include <variant>
 
@@ -84,7 +86,21 @@ CLI::Validator not_negative() {
     if (text.starts_with('-')) return "must not be negative, got " + text;
     std::uint64_t number = 0;
     const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
-    return error == std::errc::result_out_of_range ? "must be below 2^64, got " + text : std::string();
+    if (error == std::errc::result_out_of_range) return "must be below 2^64, got " + text;
+    return text.empty() || CLI::detail::lexical_cast(text, number) ? "" : fmt::format("expected a whole number, got '{}'", text);
+  };
+  return {check, ""};
+}
+
+// Text that CLI11 can read as a number of this type. Of an empty one require_value() speaks.
+template <typename T>
+CLI::Validator number_of_type() {
+  const auto check = [](const std::string& text) {
+    T number = 0;
+    if (text.empty() || CLI::detail::lexical_cast(text, number)) return std::string();
+    const std::string kind =
+        std::is_integral_v<T> ? fmt::format("a whole number, at most {}", std::numeric_limits<T>::max()) : "a number";
+    return fmt::format("expected {}, got '{}'", kind, text);
   };
   return {check, ""};
 }
@@ -176,8 +192,10 @@ class Parsing {
               return app_.add_flag(
                   flag, [one](std::int64_t n) { *one.value = n == 0; }, help);
             },
-            [&](int* value) { return app_.add_option(flag, *value, help)->capture_default_str(); },
-            [&](double* value) { return app_.add_option(flag, *value, help)->capture_default_str(); },
+            [&](int* value) { return app_.add_option(flag, *value, help)->check(number_of_type<int>())->capture_default_str(); },
+            [&](double* value) {
+              return app_.add_option(flag, *value, help)->check(number_of_type<double>())->capture_default_str();
+            },
             [&](std::string* value) { return app_.add_option(flag, *value, help); },
             [&](std::uint64_t* value) {
               return app_.add_option(flag, *value, help)->check(not_negative())->capture_default_str();
@@ -209,7 +227,9 @@ class Parsing {
     if constexpr (std::is_same_v<T, std::vector<std::string>>) {
       return app_.add_option(flag_of(option), texts_[option.name], help_of(option));
     } else {
-      return app_.add_option(flag_of(option), *value, help_of(option));
+      CLI::Option* added = app_.add_option(flag_of(option), *value, help_of(option));
+      if constexpr (std::is_arithmetic_v<T>) added->check(number_of_type<T>());
+      return added;
     }
   }
 
@@ -273,6 +293,20 @@ std::string unknown_option(const CLI::App& app) {
     }
   }
   return "";
+}
+
+std::string in_plain_words(const std::string& error) {
+  static const std::regex several(R"((\S+): At Most \d+ required but received (\d+))"),
+      none(R"((\S+): \d+ required \S+ missing)");
+  static const std::regex output("^--output\\b");
+  std::smatch part;
+  std::string text = error;
+  if (std::regex_match(error, part, several)) {
+    text = fmt::format("{} is given {}", part.str(1), part.str(2) == "2" ? "twice" : part.str(2) + " times");
+  } else if (std::regex_match(error, part, none)) {
+    text = part.str(1) + ": its value is missing";
+  }
+  return std::regex_replace(text, output, "-o (--output)");
 }
 
 void add_command(CLI::App& app, Command command) {

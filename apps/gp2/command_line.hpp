@@ -28,6 +28,9 @@ std::size_t help_width();
 /// @return what is wrong with it, as a sentence; empty where there is none
 std::string unknown_option(const CLI::App& app);
 
+/// What CLI11 says of a command line that cannot be read, as a sentence of ours.
+std::string in_plain_words(const std::string& error);
+
 /// The options of a command as a table of docs/command-line.md.
 std::string markdown_table(const Command& command);
 

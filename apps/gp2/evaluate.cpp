@@ -62,24 +62,35 @@ Json to_json(const Evaluation& e) {
   return json;
 }
 
-std::string coverages(const Calibration& of) {
-  return fmt::format("{:.3g}, {:.3g}, {:.3g}", of.coverage50, of.coverage80, of.coverage95);
+// to so many digits
+std::string figure(double value, int digits) {
+  return std::isfinite(value) ? fmt::format("{:.{}g}", value, digits) : "not defined";
+}
+
+std::string coverages(double of50, double of80, double of95) {
+  if (!std::isfinite(of95)) return "not defined";
+  return fmt::format("{:.3g}, {:.3g}, {:.3g}", of50, of80, of95);
 }
 
 void print_text(const Evaluation& e) {
   for (std::size_t k = 0; k < e.outputs.size(); ++k)
-    print_result("rmse {:<22} {:.6g}\n", e.outputs[k], e.rmse[static_cast<Eigen::Index>(k)]);
-  print_result("rmse / training std         {:.6g}   (mean over outputs)\n", e.rmse_normalised);
-  print_result("nrmse                       {:.6g}   (rms error / rms of the test spreads)\n", e.nrmse);
-  print_result("max |A ddq - b|             {:.3g}   (fitted parameters; those of the model file: {:.3g})\n",
-               e.max_constraint_error_fitted, e.max_constraint_error);
-  print_result("nlpd; 50, 80, 95 % coverage {:.4g}; {}   (with measurement noise)\n", e.nlpd, coverages(e));
-  print_result("the same, noise-free        {:.4g}; {:.3g}, {:.3g}, {:.3g}   ({} marginals without variance left out)\n",
-               e.nlpd_latent, e.coverage50_latent, e.coverage80_latent, e.coverage95_latent, e.n_zero_variance);
+    print_result("rmse {:<22} {}\n", e.outputs[k], figure(e.rmse[static_cast<Eigen::Index>(k)], 6));
+  print_result("rmse / training std         {}   (mean over outputs)\n", figure(e.rmse_normalised, 6));
+  print_result("nrmse                       {}   (rms error / rms of the test spreads{})\n", figure(e.nrmse, 6),
+               std::isfinite(e.nrmse) && e.nrmse > 1 ? "; above 1 their mean predicts better" : "");
+  print_result("max |A ddq - b|             {}   (fitted parameters; those of the model file: {})\n",
+               figure(e.max_constraint_error_fitted, 3), figure(e.max_constraint_error, 3));
+  print_result("nlpd; 50, 80, 95 % coverage {}; {}   (with measurement noise)\n", figure(e.nlpd, 4),
+               coverages(e.coverage50, e.coverage80, e.coverage95));
+  if (std::isfinite(e.nlpd_latent)) {
+    print_result("the same without noise      {}; {}   (right only for targets without noise{})\n", figure(e.nlpd_latent, 4),
+                 coverages(e.coverage50_latent, e.coverage80_latent, e.coverage95_latent),
+                 e.n_zero_variance > 0 ? fmt::format("; {} marginals without variance left out", e.n_zero_variance) : "");
+  }
   for (const auto& [name, part] : {std::pair("near the data  ", &e.near), std::pair("far from them  ", &e.far)}) {
     if (e.far.n == 0 || part->n == 0) continue;
-    print_result("{}             {:.3g} % of the points: nrmse {:.4g}; coverage {}\n", name, 100.0 * part->n / e.n, part->nrmse,
-                 coverages(*part));
+    print_result("{}             {:.3g} % of the points: nrmse {}; coverage {}\n", name, 100.0 * part->n / e.n,
+                 figure(part->nrmse, 4), coverages(part->coverage50, part->coverage80, part->coverage95));
   }
   print_result("points                      {}{}\n", e.n,
                e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");

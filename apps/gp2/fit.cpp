@@ -61,8 +61,9 @@ void say_how_far(const Progress& p) {
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
   const std::string place = p.is_drawing ? "drawing hyperparameters"
                                          : fmt::format("restart {}/{}  iteration {}", p.restart + 1, p.n_restarts, p.iteration);
+  const std::string rows = p.n_states > 0 ? fmt::format("{} rows  ", p.n_states) : "";
   const std::string best = std::isfinite(p.best) ? fmt::format("{:.4f}", p.best) : "none yet";
-  print_progress(fmt::format("{}  best {}  about {:.0f} s left", place, best, left));
+  print_progress(fmt::format("{}{}  best {}  about {:.0f} s left", rows, place, best, left));
 }
 
 Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }

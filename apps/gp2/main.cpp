@@ -155,7 +155,7 @@ int main(int argc, char** argv) {
   } catch (const CLI::ParseError& error) {
     // CLI11 names an option that is missing before one that is misspelt
     const std::string unknown = gp2::command::unknown_option(app);
-    return usage_error(unknown.empty() ? error.what() : unknown);
+    return usage_error(unknown.empty() ? gp2::command::in_plain_words(error.what()) : unknown);
   } catch (const gp2::command::UsageError& error) {
     return usage_error(error.text);
   } catch (const gp2::command::Interrupted& interrupted) {

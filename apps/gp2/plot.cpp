@@ -19,6 +19,7 @@ struct PlotArguments {
 
 void run(const PlotArguments& arguments) {
   require_output(arguments.output, {arguments.fit});
+  require_name_of_svg(arguments.output);
   const FitFile fit = FitFile::read(arguments.fit);
   const LearnedCurve curve = learned_curve(fit.posterior(), arguments.request);
   write_file(arguments.output, plot(curve, fit.model));

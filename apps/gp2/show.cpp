@@ -31,7 +31,8 @@ Command show_command() {
     const std::string text = read_file(a->file);
     const std::size_t first = text.find_first_not_of(" \t\r\n");
     const bool is_fit = first != std::string::npos && text[first] == '{';  // no model file begins so
-    print_result("{}", is_fit ? show(FitFile::parse(text, a->file), a->request) : show(Model::parse(text, a->file), a->request));
+    print_result("{}", is_fit ? show(FitFile::parse(text, a->file), a->request, with_flags)
+                              : show(Model::parse(text, a->file), a->request));
   };
   return command;
 }

@@ -27,6 +27,7 @@ struct Progress {
   double seconds = 0;
   double fraction = 0;      // of the work, estimated
   bool is_drawing = false;  // hyperparameters, after the restarts
+  int n_states = 0;         // of those of a long log that are fitted by turns, with a best of their own; 0: all at once
 };
 
 struct FitReport;

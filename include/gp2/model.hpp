@@ -135,9 +135,11 @@ class Model {
   /// coordinates and velocities.
   [[nodiscard]] Expression expression(std::string_view text) const;
 
-  /// The unit of a quantity, of the view of one latent too (`force_x@friction`). Empty: not known.
+  /// `units`, and those that are known without being stated: of angles, of the joints of a robot, and what follows from them.
+  [[nodiscard]] std::map<std::string, std::string> known_units() const;
+  /// The unit in `units` of a quantity, of the view of one latent too (`force_x@friction`). Empty: not stated.
   [[nodiscard]] std::string unit_of(std::string_view quantity) const;
-  /// The quantity with its unit, for an axis: "dx [m/s]"; alone where that is not known.
+  /// The quantity with its unit, for an axis: "dx [m/s]"; alone where that is not among known_units().
   [[nodiscard]] std::string labelled(const std::string& quantity) const;
 
   /// The variables of the system in `graph`.

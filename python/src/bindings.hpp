@@ -18,6 +18,7 @@
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
 
@@ -98,8 +99,8 @@ void tell(const std::vector<std::string>& notes);
 class States {
  public:
   /// @throws InputError when an entry that the prior or the view reads is not finite; as Rows and read_log_states.
-  States(const py::object& data, const Prior& prior, const View& view, const Model& model, const std::vector<Actuator>& actuators,
-         const py::object& columns);
+  /// @param parameters  fitted, of the system that is predicted
+  States(const py::object& data, const PredictedView& at, const Eigen::VectorXd& parameters, const py::object& columns);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (layout size × n)
 

@@ -284,6 +284,8 @@ void add_fit(py::module_& module) {
       .def_readonly("best", &Progress::best, "Lowest objective so far.")
       .def_readonly("seconds", &Progress::seconds, "Since the fit began.")
       .def_readonly("is_drawing", &Progress::is_drawing, "Whether hyperparameters are drawn, after the restarts.")
+      .def_readonly("n_states", &Progress::n_states,
+                    "Of those of a long log that are fitted by turns, with a best of their own; 0: all at once.")
       .def_readonly("fraction", &Progress::fraction, "Of the work, estimated.");
 
   {

@@ -1,6 +1,8 @@
 #include "options.hpp"
 
 #include <algorithm>
+#include <string_view>
+#include <type_traits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -22,9 +24,16 @@ namespace gp2::python {
 
 namespace {
 
+bool is_truth_value(py::handle given) {
+  const std::string_view type = Py_TYPE(given.ptr())->tp_name;
+  return type == "bool" || type == "numpy.bool" || type == "numpy.bool_";
+}
+
+// Python's own conversions take True for the number 1, and any number for true; as an option each is a slip.
 template <typename T>
 T cast(py::handle given, const std::string& name, const std::string& expected) {
   try {
+    if (std::is_arithmetic_v<T> && std::is_same_v<T, bool> != is_truth_value(given)) throw py::cast_error();
     return given.cast<T>();
   } catch (const py::cast_error&) {
     throw py::type_error(fmt::format("{}: expected {}, got {}", name, expected, std::string(py::repr(given))));

@@ -14,6 +14,7 @@
 #include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/export_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/shoot_job.hpp"
@@ -51,7 +52,7 @@ struct Asked {
   Asked(const PyPosterior& self, ViewRequest request_of_view, const py::object& data, const py::object& columns)
       : request(std::move(request_of_view)),
         at(predicted_view(self.file, self.posterior.prior(), request)),
-        states(data, at.prior, at.view, *at.model, at.actuators, columns) {}
+        states(data, at, parameters_of(at.view, self.posterior.values().parameters), columns) {}
 
   /// What `work` says without the interpreter's lock, with the table named in what it throws.
   template <typename Work>
@@ -139,6 +140,7 @@ py::array sample(const PyPosterior& self, const py::object& data, int n_samples,
   require_at_least(1, n_samples, "n_samples");
   const Asked asked(self, view_request(arguments), data, columns);
   const Posterior posterior = self.posterior;
+  require_memory_of_samples(posterior, asked.at.view, asked.states.matrix().cols(), n_samples, free_memory());
   MatrixXd samples = asked.unlocked_and_named([&] {
     return posterior.sample({{asked.at.view, asked.states.matrix()}}, n_samples, seed);
   });
@@ -182,7 +184,9 @@ Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, cons
     if (!accelerations.is_none() || !outputs.empty()) {
       throw InputError("accelerations and outputs go with an array of states; those of a table are its columns");
     }
-    wanted = read_wanted_motion(at.prior, *at.model, to_table(data, "states"), columns_argument(columns));
+    const Eigen::VectorXd& fitted = self.posterior.values().parameters;
+    wanted = read_wanted_motion(at.prior, *at.model, to_table(data, "states"), columns_argument(columns),
+                                at.other_system ? at.other_system->parameters(fitted) : fitted);
     tell(wanted.notes);
   }
   wanted.view.other_system = at.other_system;
@@ -273,8 +277,10 @@ void update_with(PyPosterior& self, const py::object& data, const GivenNames& ob
     return;
   }
   // a step that is refused undoes those before it
-  const auto undo = [&self, draws = self.file.report.draws, logs = self.file.logs, source = self.file.data_source] {
+  const auto undo = [&self, draws = self.file.report.draws, logs = self.file.logs, source = self.file.data_source,
+                     said = self.file.notes] {
     self.file.report.draws = draws;
+    self.file.notes = said;
     self.file.logs = logs;
     self.file.data_source = source;
   };
@@ -298,7 +304,8 @@ PyPosterior load(const py::object& path, const PySystem* system) {
   FitFile file = FitFile::read(path_argument(path), code_of(system));
   Posterior posterior = file.posterior();
   file.observations.clear();
-  return {std::move(file), std::move(posterior), {}};
+  std::vector<std::string> notes = with_keywords(file.notes.value_or(std::vector<std::string>()));
+  return {std::move(file), std::move(posterior), std::move(notes)};
 }
 
 void save(const PyPosterior& self, const py::object& path) {
@@ -396,7 +403,8 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
             return py::module_::import("json").attr("loads")(self.file.options);
           },
           "What the fit was asked, a dict under the names of the options of gp2 fit; None where a file does not say.")
-      .def_readonly("notes", &PyPosterior::notes, "What the reading of the data had to say.")
+      .def_readonly("notes", &PyPosterior::notes,
+                    "What the reading of the data and the fit had to say; of a file, what the fit had.")
       .def_property_readonly(
           "n_data", [](const PyPosterior& self) { return self.posterior.n_states(); }, "Observed states.")
       .def_property_readonly(

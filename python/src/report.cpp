@@ -66,6 +66,7 @@ std::string report(const py::object& fit, const py::object& path, const py::obje
 std::string plot_fit(const py::object& fit, const py::object& path, const py::kwargs& keywords) {
   PlotRequest request;
   read_keywords("plot", keywords, options(request));
+  if (!path.is_none()) require_name_of_svg(path_argument(path));
   const auto picture = [&request](const Posterior& posterior, const Model& model) {
     return unlocked([&] { return plot(learned_curve(posterior, request), model); });
   };

@@ -123,7 +123,7 @@ std::string show_posterior(const PyPosterior& self, const py::kwargs& keywords) 
   read_keywords("show", keywords, options(asked));
   FitFile fit = self.file;
   fit.take_data(self.posterior);
-  return show(fit, asked);
+  return show(fit, asked, [](const std::string& note) { return with_keywords(note); });
 }
 
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const py::kwargs& keywords) {
@@ -190,12 +190,11 @@ void tell(const std::vector<std::string>& notes) {
   }
 }
 
-States::States(const py::object& data, const Prior& prior, const View& view, const Model& model,
-               const std::vector<Actuator>& actuators, const py::object& columns) {
-  const System& system = *prior.system;
+States::States(const py::object& data, const PredictedView& at, const Eigen::VectorXd& parameters, const py::object& columns) {
+  const System& system = *at.prior.system;
   if (!is_array(data)) {
     const CsvTable table = to_table(data, "states");
-    LogStates log = read_log_states(prior, view, model, table, columns_argument(columns), {}, actuators);
+    LogStates log = read_log_states(at.prior, at.view, *at.model, table, columns_argument(columns), {}, at.actuators, parameters);
     tell(log.notes);
     table_ = table.name();
     read_ = std::move(log.states);
@@ -204,10 +203,13 @@ States::States(const py::object& data, const Prior& prior, const View& view, con
   const std::vector<std::string> names = system.state_names();
   array_.emplace(data, names, "states");
   const auto states = matrix();
-  std::vector<bool> reads = prior.reads();
-  const std::vector<bool> of_view = view.reads(system);
+  std::vector<bool> reads = at.prior.reads();
+  const std::vector<bool> of_view = at.view.reads(system);
   for (std::size_t k = 0; k < reads.size(); ++k) {
     if (!reads[k] && !of_view[k]) continue;
+    if (states.cols() > 1 && states.row(static_cast<Eigen::Index>(k)).array().isNaN().all()) {
+      throw InputError(fmt::format("states: missing column '{}': no row has a number there", names[k]));
+    }
     for (Eigen::Index i = 0; i < states.cols(); ++i) {
       const double value = states(static_cast<Eigen::Index>(k), i);
       if (std::isfinite(value)) continue;

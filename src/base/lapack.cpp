@@ -1,6 +1,7 @@
 #include "base/lapack.hpp"
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <mutex>
 
@@ -8,6 +9,7 @@
 
 #include "base/mapped_memory.hpp"
 #include "base/parallel.hpp"
+#include "base/simd.hpp"
 #include "gp2/error.hpp"
 
 // present in OpenBLAS only; another BLAS keeps its own threading
@@ -213,14 +215,24 @@ void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces) {
 
 namespace {
 
-// B ← L⁻¹ B, or L⁻ᵀ B, by halves: dtrsm of OpenBLAS' kernels for AVX-512 takes twice the time of products of that size.
-void solve_lower(int n, Block L, bool transposed, int n_columns, Block B) {
-  constexpr int small = 32;
-  const double one = 1, minus_one = -1;
-  if (n <= small) {
-    dtrsm_("L", "L", transposed ? "T" : "N", "N", &n, &n_columns, &one, L.data, &L.stride, B.data, &B.stride, 1, 1, 1, 1);
-    return;
+constexpr int most_solved = static_cast<int>(simd::Loops<double>::most_rows);
+
+// Of a small triangle: dtrsm of OpenBLAS' kernels for AVX-512 takes ten times as long.
+void solve_small(int n, Block L, bool transposed, int n_columns, Block B) {
+  std::array<double, most_solved * most_solved> triangle;
+  for (int i = 0; i < n; ++i) {
+    double* const row = &triangle[static_cast<std::size_t>(i) * static_cast<std::size_t>(n)];
+    // Lᵀ from its last row and column on is a lower triangle too
+    for (int k = 0; k <= i; ++k) row[k] = transposed ? *L.at(n - 1 - k, n - 1 - i).data : *L.at(i, k).data;
+    row[i] = 1 / row[i];
   }
+  simd::loops().solve_triangle(n, triangle.data(), transposed, n_columns, B.data, B.stride);
+}
+
+// B ← L⁻¹ B, or L⁻ᵀ B, by halves
+void solve_lower(int n, Block L, bool transposed, int n_columns, Block B) {
+  const double one = 1, minus_one = -1;
+  if (n <= most_solved) return solve_small(n, L, transposed, n_columns, B);
   const int first = first_half(n), second = n - first;
   const Block L21 = L.at(first, 0), L22 = L.at(first, first), B2 = B.at(first, 0);
   if (transposed) {

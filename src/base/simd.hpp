@@ -41,6 +41,10 @@ struct Loops {
   /// s_i ← s_i k_i
   /// sums_l,lane += b_l Σ s_i B_il over the i of each lane (lanes × m)
   void (*contract)(Size n, Size m, T* s, const T* k, const T* B, Size ldb, const T* b, T* h, T* sums);
+  /// B ← T⁻¹ B, or with B's rows from the last to the first (n × m, any numbers, n at most most_rows). T is lower triangular, by rows
+  /// (n × n), with the reciprocals of its diagonal in place of it.
+  void (*solve_triangle)(Size n, const T* triangle, bool reversed, Size m, T* B, Size ldb);
+  static constexpr Size most_rows = 64;
 };
 
 /// The loops of one instruction set.

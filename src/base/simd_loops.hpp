@@ -2,6 +2,8 @@
 // GP2_SIMD_BYTES how wide its vectors are. Nothing of another header may be called here: an inline function compiled for a wide
 // set could stand in for the same function elsewhere in the program, and stop it on a narrower processor.
 
+#include <utility>
+
 #include "base/simd.hpp"
 
 #if !defined(GP2_SIMD_BYTES)
@@ -55,6 +57,22 @@ struct Vector {
   }
   static inline void store(T* x, Type v) { __builtin_memcpy(x, &v, sizeof v); }
   static inline Type all(T x) { return x - Type{}; }
+
+  // Exchanges one bit of the number of a row, a without it and b with it, with that of the number of a column.
+  template <Size bit, Size... column>
+  static inline void exchange(Type& a, Type& b, std::integer_sequence<Size, column...>) {
+    const Type before = a;
+    a = __builtin_shufflevector(before, b, ((column & bit) != 0 ? width + column - bit : column)...);
+    b = __builtin_shufflevector(before, b, ((column & bit) != 0 ? width + column : column + bit)...);
+  }
+  // (width × width)
+  template <Size bit = width / 2>
+  static inline void transpose(Type* rows) {
+    for (Size i = 0; i < width; ++i) {
+      if ((i & bit) == 0) exchange<bit>(rows[i], rows[i + bit], std::make_integer_sequence<Size, width>());
+    }
+    if constexpr (bit > 1) transpose<bit / 2>(rows);
+  }
   static inline T sum(Type v) {
     T total = 0;
     for (Size i = 0; i < width; ++i) total += v[i];
@@ -261,10 +279,97 @@ void contract(Size n, Size m, T* s, const T* k, const T* B, Size ldb, const T* b
   }
 }
 
+// Some columns of a matrix by rows, each of whole vectors.
+template <typename T>
+struct Tile {
+  using V = Vector<T>;
+  static constexpr Size n_vectors = 4, width = n_vectors * V::width;
+  alignas(64) T rows[Loops<T>::most_rows * width];
+
+  // Calls of_block(first row, first column) for whole blocks of V::width × V::width of n × m entries, of_entry(row, column) for others.
+  template <typename OfBlock, typename OfEntry>
+  static inline void for_each(Size n, Size m, const OfBlock& of_block, const OfEntry& of_entry) {
+    for (Size j = 0; j < m; j += V::width) {
+      const Size count = m - j < V::width ? m - j : V::width;
+      Size i = 0;
+      for (; count == V::width && i + V::width <= n; i += V::width) of_block(i, j);
+      for (; i < n; ++i) {
+        for (Size k = 0; k < count; ++k) of_entry(i, j + k);
+      }
+    }
+  }
+
+  // first: the row of the first one, step: from each to the next
+  inline void take(Size n, Size m, const T* B, Size ldb, T* first, Size step) {
+    if (m < width) {
+      for (Size i = 0; i < n * width; ++i) rows[i] = 0;
+    }
+    for_each(
+        n, m,
+        [&](Size i, Size j) {
+          typename V::Type block[V::width];
+          for (Size k = 0; k < V::width; ++k) block[k] = V::load(B + (j + k) * ldb + i);
+          V::transpose(block);
+          for (Size k = 0; k < V::width; ++k) V::store(first + (i + k) * step + j, block[k]);
+        },
+        [&](Size i, Size j) { first[i * step + j] = B[j * ldb + i]; });
+  }
+  inline void give(Size n, Size m, T* B, Size ldb, const T* first, Size step) const {
+    for_each(
+        n, m,
+        [&](Size i, Size j) {
+          typename V::Type block[V::width];
+          for (Size k = 0; k < V::width; ++k) block[k] = V::load(first + (i + k) * step + j);
+          V::transpose(block);
+          for (Size k = 0; k < V::width; ++k) V::store(B + (j + k) * ldb + i, block[k]);
+        },
+        [&](Size i, Size j) { B[j * ldb + i] = first[i * step + j]; });
+  }
+
+  // x_i ← (x_i − Σ_k<i T_ik x_k)/T_ii, two rows at once
+  inline void solve(Size n, const T* triangle) {
+    typename V::Type a[n_vectors], b[n_vectors];
+    for (Size i = 0; i < n; i += 2) {
+      const bool is_last = i + 1 == n;
+      T* const x = rows + i * width;
+      const T *const of_a = triangle + i * n, *const of_b = is_last ? of_a : of_a + n;
+      for (Size v = 0; v < n_vectors; ++v) {
+        a[v] = V::load(x + v * V::width);
+        b[v] = is_last ? a[v] : V::load(x + width + v * V::width);
+      }
+      for (Size k = 0; k < i; ++k) {
+        for (Size v = 0; v < n_vectors; ++v) {
+          const typename V::Type known = V::load(rows + k * width + v * V::width);
+          a[v] -= V::all(of_a[k]) * known;
+          b[v] -= V::all(of_b[k]) * known;
+        }
+      }
+      for (Size v = 0; v < n_vectors; ++v) {
+        a[v] *= V::all(of_a[i]);
+        V::store(x + v * V::width, a[v]);
+        if (!is_last) V::store(x + width + v * V::width, (b[v] - V::all(of_b[i]) * a[v]) * V::all(of_b[i + 1]));
+      }
+    }
+  }
+};
+
+template <typename T>
+void solve_triangle(Size n, const T* triangle, bool reversed, Size m, T* B, Size ldb) {
+  Tile<T> tile;
+  const Size step = reversed ? -Tile<T>::width : Tile<T>::width;
+  T* const first = reversed ? tile.rows + (n - 1) * Tile<T>::width : tile.rows;
+  for (Size j = 0; j < m; j += Tile<T>::width) {
+    const Size count = m - j < Tile<T>::width ? m - j : Tile<T>::width;
+    tile.take(n, count, B + j * ldb, ldb, first, step);
+    tile.solve(n, triangle);
+    tile.give(n, count, B + j * ldb, ldb, first, step);
+  }
+}
+
 template <typename T>
 constexpr Loops<T> make_loops() {
   return {squared_distance<T>,    squared_exponential<T>,  exponential<T>,         weighted_sums<T>, weighted_differences<T>,
-          difference_products<T>, add_weighted_squares<T>, add_scaled_products<T>, contract<T>};
+          difference_products<T>, add_weighted_squares<T>, add_scaled_products<T>, contract<T>,      solve_triangle<T>};
 }
 
 }  // namespace

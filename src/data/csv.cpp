@@ -241,16 +241,18 @@ class CsvTable::Builder {
   }
 
   void read_row(std::string_view line) {
+    const bool is_comment = line.starts_with('#');
     std::size_t n_cells = 0;
     read_cell(line, n_cells++);
     while (!line.empty()) {
       line.remove_prefix(1);  // the comma
       read_cell(line, n_cells++);
     }
-    if (n_cells != content_.header.size()) {
-      throw InputError(
-          fmt::format("{}: ragged row: {} cells, but the header has {} columns", where(), n_cells, content_.header.size()));
-    }
+    if (n_cells == content_.header.size()) return;
+    const bool has_comment = is_comment || content_.header.front().starts_with('#');
+    throw InputError(fmt::format("{}: ragged row: {} cells, but the header has {} columns{}", where(), n_cells,
+                                 content_.header.size(),
+                                 has_comment ? ": a line that begins with # is not read as a comment; remove it" : ""));
   }
 
   // the cell at the front of `line`, which is left with what follows it

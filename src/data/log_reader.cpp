@@ -1,11 +1,13 @@
 #include "gp2/data/log_reader.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "base/number_range.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -20,6 +22,18 @@ std::string number_after(const std::string& prefix, const std::string& name) {
   if (!name.starts_with(prefix) || name.size() == prefix.size()) return "";
   const std::string rest = name.substr(prefix.size());
   return rest.find_first_not_of("0123456789") == std::string::npos ? rest : "";
+}
+
+// The numbers of a column, each as `number` reads its cell.
+Eigen::RowVectorXd numbers_of(const CsvTable& table, int column, double (CsvTable::*number)(int, int) const) {
+  Eigen::RowVectorXd values(table.n_rows());
+  for (int row = 0; row < table.n_rows(); ++row) {
+    values[row] = (table.*number)(row, column);
+    if (!(std::abs(values[row]) > largest_number)) continue;
+    throw InputError(fmt::format("{}: {:.3g} is too large: at most {:.0e} can be computed with", table.place(row, column),
+                                 values[row], largest_number));
+  }
+  return values;
 }
 
 void require_a_number(const Eigen::RowVectorXd& values, const CsvTable& table, int column, const char* mend) {
@@ -127,8 +141,7 @@ MatrixXd LogReader::read_states(const std::vector<bool>& reads, Number number) {
   MatrixXd states = MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), not_a_number);
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (!reads[k]) continue;
-    const int column = require(names[k]);
-    for (int row = 0; row < table_.n_rows(); ++row) states(static_cast<Index>(k), row) = (table_.*number)(row, column);
+    states.row(static_cast<Index>(k)) = numbers_of(table_, require(names[k]), number);
   }
   return states;
 }
@@ -136,8 +149,7 @@ MatrixXd LogReader::read_states(const std::vector<bool>& reads, Number number) {
 MatrixXd LogReader::values(const std::vector<std::string>& names) {
   MatrixXd values(static_cast<Index>(names.size()), table_.n_rows());
   for (std::size_t k = 0; k < names.size(); ++k) {
-    const int column = require(names[k]);
-    for (int row = 0; row < table_.n_rows(); ++row) values(static_cast<Index>(k), row) = table_.number(row, column);
+    values.row(static_cast<Index>(k)) = numbers_of(table_, require(names[k]), &CsvTable::number);
   }
   return values;
 }
@@ -147,7 +159,7 @@ MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
   for (std::size_t k = 0; k < names.size(); ++k) {
     const int column = require(names[k]);
     const auto row_of_values = static_cast<Index>(k);
-    for (int row = 0; row < table_.n_rows(); ++row) values(row_of_values, row) = table_.number_or_empty(row, column);
+    values.row(row_of_values) = numbers_of(table_, column, &CsvTable::number_or_empty);
     require_a_number(values.row(row_of_values), table_, column, "observe others (`observe`)");
   }
   return values;
@@ -167,15 +179,15 @@ MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
   for (std::size_t k = 0; k < names.size(); ++k) {
     const int column = table_.find(stddev_column(names[k]));
     used_.emplace(column, names[k] + "_std");
+    stddevs.row(static_cast<Index>(k)) = numbers_of(table_, column, &CsvTable::number_or_empty);
     for (int row = 0; row < table_.n_rows(); ++row) {
-      const double stddev = table_.number_or_empty(row, column);
+      const double stddev = stddevs(static_cast<Index>(k), row);
       if (stddev <= 0) {
         throw InputError(
             fmt::format("{}: the standard deviation of {} must be positive, got {}; leave the cell empty where nothing is "
                         "measured",
                         table_.place(row, column), names[k], stddev));
       }
-      stddevs(static_cast<Index>(k), row) = stddev;
     }
     require_a_number(stddevs.row(static_cast<Index>(k)), table_, column, "leave the column out");
   }

@@ -7,6 +7,7 @@
 
 #include <fmt/format.h>
 
+#include "base/number_range.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -78,8 +79,9 @@ void Noise::require_noise_of(const MatrixXd& values) const {
                                  values.rows(), stddev_.size()));
   }
   for (const double sigma : stddev_) {
-    if (sigma > 0 && std::isfinite(sigma)) continue;
-    throw InputError(fmt::format("observations: `noise_stddev` must be positive and finite, got {}", sigma));
+    if (sigma > 0 && sigma <= largest_number) continue;
+    throw InputError(
+        fmt::format("observations: `noise_stddev` must be positive and at most {:.0e}, got {}", largest_number, sigma));
   }
   if (!has_scale()) return;
   if (scale().rows() != values.rows() || scale().cols() != values.cols()) {

@@ -94,6 +94,7 @@ void FitFile::write(const std::filesystem::path& path) const {
   require_hyperparameters(home, observations, report.hyperparameters);
   json["hyperparameters"] = hyperparameters_json(report.hyperparameters, home);
   json["report"] = report_json(report);
+  if (notes) json["report"]["notes"] = *notes;
   if (!report.actuators.empty()) json["actuators"] = actuators_json(report.actuators);
   if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
@@ -190,6 +191,7 @@ FitFile fit_from(ParsedJson& json, const ModelCode& code) {
   fit.report.hyperparameters = hyperparameters_from(json.at("hyperparameters"));
   locate_in_model(fit.report.hyperparameters, prior, fit.observations);
   read_report(json.at("report"), prior, fit.observations, fit.report);
+  if (json.at("report").contains("notes")) fit.notes = json.at("report").at("notes").get<std::vector<std::string>>();
   if (json.contains("actuators")) fit.report.actuators = actuators_from(json.at("actuators"), fit.model.actuators);
   return fit;
 }

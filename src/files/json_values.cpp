@@ -25,6 +25,11 @@ ParsedJson parse_json(std::string_view text, const std::filesystem::path& path) 
     return true;
   };
   ParsedJson json = ParsedJson::parse(text, check_depth, false);
+  const std::string ending = path.extension().string();
+  if (json.is_discarded() && (ending == ".toml" || ending == ".csv")) {
+    throw InputError(fmt::format("{}: not valid JSON but {}, by its name: a FIT.json is wanted here, which gp2 fit writes",
+                                 path.string(), ending == ".csv" ? "a table" : "a model file"));
+  }
   if (json.is_discarded()) {
     throw InputError(
         fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));

@@ -12,6 +12,7 @@
 #include <Eigen/Core>
 #include <nlohmann/json.hpp>
 
+#include "base/number_range.hpp"
 #include "gp2/error.hpp"
 
 // Numbers, choices and matrices in JSON. What reads them says by an InputError what stands where something else must.
@@ -36,9 +37,6 @@ Choice choice_from(const ParsedJson& json, const std::array<Named<Choice>, n>& c
   if (known == choices.end()) throw InputError(fmt::format("'{}' is no {}", name, what));
   return known->first;
 }
-
-// No quantity, and the square of none, is beyond these: sums over data stay finite.
-inline constexpr double largest_number = 1e100, smallest_scale = 1e-100;
 
 /// @param path  stands for the file in messages
 ParsedJson parse_json(std::string_view text, const std::filesystem::path& path);

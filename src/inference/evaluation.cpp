@@ -12,6 +12,7 @@
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/leave_one_out.hpp"
+#include "inference/cross_validation.hpp"
 
 namespace gp2 {
 
@@ -96,20 +97,29 @@ struct Scores {
 
 // Calls visit(group number, row of its view) for all observations of row `row` of ddq.
 template <typename Visit>
-void for_each_observed(const Posterior& posterior, int row, const Visit& visit) {
-  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
-    const View& view = posterior.observations()[g].view();
+void for_each_observed(const std::vector<Observations>& observations, int row, const Visit& visit) {
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const View& view = observations[g].view();
     if (!view.is_of_ddq()) continue;
     const auto found = std::find(view.rows.begin(), view.rows.end(), row);
     if (found != view.rows.end()) visit(g, found - view.rows.begin());
   }
 }
 
+// The rows of ddq that any observation has, in order.
+std::vector<int> rows_of(const std::vector<Observations>& observations) {
+  std::set<int> rows;
+  for (const Observations& group : observations) {
+    if (group.view().is_of_ddq()) rows.insert(group.view().rows.begin(), group.view().rows.end());
+  }
+  return {rows.begin(), rows.end()};
+}
+
 // Standard deviation of row `row` of ddq over all observations of it; NaN where there are none.
-double training_spread(const Posterior& posterior, int row) {
+double training_spread(const std::vector<Observations>& observations, int row) {
   std::vector<double> values;
-  for_each_observed(posterior, row, [&](std::size_t g, Index k) {
-    const auto observed = posterior.observations()[g].values().row(k);
+  for_each_observed(observations, row, [&](std::size_t g, Index k) {
+    const auto observed = observations[g].values().row(k);
     values.insert(values.end(), observed.begin(), observed.end());
   });
   if (values.empty()) return not_a_number;
@@ -163,20 +173,14 @@ VectorXd pit_histogram(const Ref<const VectorXd>& z, int n_bins) {
   return counts.shares();
 }
 
-std::vector<int> observed_rows(const Posterior& posterior) {
-  std::set<int> rows;
-  for (const Observations& group : posterior.observations()) {
-    if (group.view().is_of_ddq()) rows.insert(group.view().rows.begin(), group.view().rows.end());
-  }
-  return {rows.begin(), rows.end()};
-}
+std::vector<int> observed_rows(const Posterior& posterior) { return rows_of(posterior.observations()); }
 
 MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
   MatrixXd noise(std::ssize(rows), n_states);
   for (Index r = 0; r < noise.rows(); ++r) {
     double usual = not_a_number, factor = 1;
     bool is_first = true, is_first_stated = true;
-    for_each_observed(posterior, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
+    for_each_observed(posterior.observations(), rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
       const Observations& group = posterior.observations()[g];
       const VectorXd sigma = posterior.noise_stddev(g);
       if (std::exchange(is_first, false)) usual = group.usual_noise(sigma)[k];
@@ -208,7 +212,8 @@ MatrixXd with_slip(const Posterior& posterior, const View& view, const Ref<const
 
 bool TrainingResidual::is_too_large() const {
   // fitted hyperparameters of few rows are too sure of themselves: they make rms of 1.8 with 89 % inside
-  return n >= 10 && rms > 2 && coverage95 < 0.85 && rms * rms > 1 + 6 * std::sqrt(2.0 / n);
+  const bool is_far = n >= 10 && rms > 2 && coverage95 < 0.85 && rms * rms > 1 + 6 * std::sqrt(2.0 / n);
+  return is_far || is_coverage_low(coverage95, n);
 }
 
 bool TrainingResidual::is_too_small() const { return n >= 20 && rms_in_noise < 0.5; }
@@ -219,12 +224,13 @@ bool TrainingResidual::is_correlated() const {
 
 namespace {
 
-std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out) {
+std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<Observations>& judged,
+                                                 const std::vector<LeaveOneOut>& left_out) {
   // of many states some are left, which do not follow each other
   const bool are_all = posterior.n_states() == n_states(posterior.observations());
   std::vector<TrainingResidual> residuals;
   for (std::size_t g = 0; g < left_out.size(); ++g) {
-    const Observations& group = posterior.observations()[g];
+    const Observations& group = judged[g];
     if (!group.view().is_of_ddq()) continue;
     const std::vector<std::string> names = group.view().names(*prior_of(posterior.prior(), group.view()).system);
     const VectorXd noise = posterior.noise_stddev(g);
@@ -267,19 +273,19 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
 
 // Of the measured values of ddq, row by row over all observations: add(scores, row, group number, row of its view, state).
 template <typename Add>
-Evaluation::Part scores_of(const Posterior& posterior, const Add& add) {
-  const std::vector<int> rows = observed_rows(posterior);
+Evaluation::Part scores_of(const std::vector<Observations>& judged, const Add& add) {
+  const std::vector<int> rows = rows_of(judged);
   Scores scores(std::ssize(rows));
   VectorXd spread(std::ssize(rows));
   for (Index r = 0; r < spread.size(); ++r) {
-    spread[r] = training_spread(posterior, rows[static_cast<std::size_t>(r)]);
-    for_each_observed(posterior, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
-      for (Index i = 0; i < posterior.observations()[g].n_data(); ++i) {
-        if (!std::isnan(posterior.observations()[g].values()(k, i))) add(scores, r, g, k, i);
+    spread[r] = training_spread(judged, rows[static_cast<std::size_t>(r)]);
+    for_each_observed(judged, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
+      for (Index i = 0; i < judged[g].n_data(); ++i) {
+        if (!std::isnan(judged[g].values()(k, i))) add(scores, r, g, k, i);
       }
     });
   }
-  for (const Observations& group : posterior.observations()) scores.n += group.view().is_of_ddq() ? group.n_data() : 0;
+  for (const Observations& group : judged) scores.n += group.view().is_of_ddq() ? group.n_data() : 0;
   return scores.part(spread.norm());
 }
 
@@ -295,16 +301,16 @@ std::vector<MatrixXd> noise_of_groups(const Posterior& posterior) {
   return noise;
 }
 
-Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out,
+Evaluation::Part scores_of(const std::vector<Observations>& judged, const std::vector<LeaveOneOut>& left_out,
                            const std::vector<MatrixXd>& noise) {
-  return scores_of(posterior, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
-    scores.add(r, posterior.observations()[g].values()(k, i) - left_out[g].mean(k, i), std::sqrt(left_out[g].variance(k, i)),
-               noise[g](k, i), /*has_variance=*/false);
+  return scores_of(judged, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
+    scores.add(r, judged[g].values()(k, i) - left_out[g].mean(k, i), std::sqrt(left_out[g].variance(k, i)), noise[g](k, i),
+               /*has_variance=*/false);
   });
 }
 
 // That the noise would have as errors, slip among it.
-double nrmse_of_noise(const Posterior& posterior, std::vector<MatrixXd> noise) {
+double nrmse_of_noise(const Posterior& posterior, const std::vector<Observations>& judged, std::vector<MatrixXd> noise) {
   for (std::size_t g = 0; g < noise.size(); ++g) {
     const Observations& group = posterior.observations()[g];
     if (group.view().is_of_ddq()) noise[g] = with_slip(posterior, group.view(), group.states(), std::move(noise[g]));
@@ -312,7 +318,7 @@ double nrmse_of_noise(const Posterior& posterior, std::vector<MatrixXd> noise) {
   const auto add = [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
     scores.add(r, noise[g](k, i), 0, not_a_number, /*has_variance=*/false);
   };
-  return scores_of(posterior, add).nrmse;
+  return scores_of(judged, add).nrmse;
 }
 
 // Whether stretches of the observations are stretches of time.
@@ -326,29 +332,31 @@ bool has_stretches(const Posterior& posterior, bool has_time_order) {
 
 }  // namespace
 
-CrossValidation cross_validate(const Posterior& posterior, bool has_time_order) {
+CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& judged, bool has_time_order) {
   const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
   const std::vector<MatrixXd> noise = noise_of_groups(posterior);
-  CrossValidation out{scores_of(posterior, left_out.values, noise), std::nullopt, training_residuals(posterior, left_out.values),
-                      nrmse_of_noise(posterior, noise)};
-  if (!left_out.stretches.empty()) out.stretches = scores_of(posterior, left_out.stretches, noise);
+  CrossValidation out{scores_of(judged, left_out.values, noise), std::nullopt,
+                      training_residuals(posterior, judged, left_out.values), nrmse_of_noise(posterior, judged, noise)};
+  if (!left_out.stretches.empty()) out.stretches = scores_of(judged, left_out.stretches, noise);
   return out;
 }
 
+CrossValidation cross_validate(const Posterior& posterior, bool has_time_order) {
+  return cross_validate(posterior, posterior.observations(), has_time_order);
+}
+
 std::string CrossValidation::text() const {
-  std::string text =
-      fmt::format("left out one by one: nrmse {:.3g}, 95 % coverage {:.3g}", one_by_one.nrmse, one_by_one.coverage95);
-  if (stretches) {
-    text += fmt::format("; in {} stretches of the log: {:.3g}, {:.3g}", n_stretches, stretches->nrmse, stretches->coverage95);
-  }
+  // values that do not vary have no spread to compare errors with
+  const auto of_part = [](const Evaluation::Part& part, const char* nrmse, const char* coverage) {
+    const std::string error = std::isfinite(part.nrmse) ? fmt::format("{}{:.3g}, ", nrmse, part.nrmse) : "";
+    return error + fmt::format("{}{:.3g}", coverage, part.coverage95);
+  };
+  std::string text = "left out one by one: " + of_part(one_by_one, "nrmse ", "95 % coverage ");
+  if (stretches) text += fmt::format("; in {} stretches of the log: {}", n_stretches, of_part(*stretches, "", ""));
   return text;
 }
 
-bool CrossValidation::predicts_little() const {
-  if (!stretches) return false;
-  const double noise = nrmse_of_noise * nrmse_of_noise, chance = 3 * noise * std::sqrt(2.0 / stretches->n);
-  return stretches->nrmse * stretches->nrmse > noise + chance + 0.25 * std::max(0.0, 1 - noise);
-}
+bool CrossValidation::predicts_little() const { return stretches && is_little_predicted(*stretches, nrmse_of_noise); }
 
 std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
                                                      const std::shared_ptr<const OtherSystem>& other_system,
@@ -434,7 +442,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.rmse = whole.rmse();
   double normalised = 0;
   for (Index k = 0; k < e.rmse.size(); ++k) {
-    normalised += e.rmse[k] / training_spread(posterior, rows[static_cast<std::size_t>(k)]);
+    normalised += e.rmse[k] / training_spread(posterior.observations(), rows[static_cast<std::size_t>(k)]);
   }
   e.rmse_normalised = normalised / static_cast<double>(rows.size());
   e.nrmse = e.rmse.norm() / spread;

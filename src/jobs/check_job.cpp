@@ -1,14 +1,18 @@
 #include "gp2/jobs/check_job.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <iterator>
 #include <mutex>
+#include <numbers>
 #include <set>
+#include <tuple>
 #include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
@@ -34,11 +38,38 @@ bool has_error(const std::vector<Finding>& findings) {
   return std::any_of(findings.begin(), findings.end(), [](const Finding& one) { return one.level == Level::error; });
 }
 
+// Priors that a fit refuses, or that it cannot follow.
+void check_priors(const System& system, std::vector<Finding>& findings) {
+  constexpr double far = 3;  // deviations
+  for (const Parameter& parameter : system.parameters()) {
+    if (!parameter.prior || !parameter.bounds) continue;
+    auto [lower, upper] = *parameter.bounds;
+    auto [middle, stddev, of_logarithm] = *parameter.prior;
+    const std::string bounds = fmt::format("[{}, {}]", lower, upper);
+    if (of_logarithm && !(lower > 0)) {
+      findings.push_back(
+          {parameter.estimate ? Level::error : Level::warning,
+           fmt::format("parameter '{}': a prior of the logarithm needs bounds above 0, got {}; a fit that estimates "
+                       "it refuses them",
+                       parameter.name, bounds)});
+      continue;
+    }
+    if (of_logarithm) std::tie(lower, upper, middle) = std::tuple(std::log(lower), std::log(upper), std::log(middle));
+    const double beyond = std::max(lower - middle, middle - upper) / stddev;
+    if (!(beyond > far)) continue;
+    findings.push_back(
+        {Level::warning, fmt::format("parameter '{}': the middle of its prior, {}, lies {:.2g} of its deviations beyond "
+                                     "the bounds {}: estimated, it would end there",
+                                     parameter.name, parameter.prior->median, beyond, bounds)});
+  }
+}
+
 void check_model(const Model& model, std::vector<Finding>& findings) {
   const System& system = *model.system;
   const auto counted = [](int n, const char* what) { return fmt::format("{} {}{}", n, what, n == 1 ? "" : "s"); };
   findings.push_back({Level::good, fmt::format("{}: '{}', {}, {}", model.name, system.name(), counted(system.nq(), "coordinate"),
                                                counted(system.nc(), "constraint"))});
+  check_priors(system, findings);
   if (!model.robot) return;
   for (const std::string& note : model.robot->notes) findings.push_back({Level::good, note});
 }
@@ -284,7 +315,25 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   }
 }
 
-// Columns that look clipped, and angles in degrees.
+// An angle that turns forth and back by more than half a turn from row to row, as one in degrees does; a wheel turns one way.
+void check_turns(const Coordinate& coordinate, const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& q,
+                 const Eigen::RowVectorXd& dq, std::vector<Finding>& findings) {
+  constexpr double often = 0.2;  // of the rows
+  const Eigen::Index n = t.size() - 1;
+  if (n < 1) return;
+  const Eigen::ArrayXd steps = (t.tail(n) - t.head(n)).transpose();
+  if (!(steps > 0).all()) return;  // also where t is not known
+  const Eigen::ArrayXd turned = steps * dq.head(n).transpose().array();
+  const Eigen::Index forth = (turned > std::numbers::pi).count(), back = (turned < -std::numbers::pi).count();
+  if (forth == 0 || back == 0 || static_cast<double>(forth + back) < often * static_cast<double>(n)) return;
+  findings.push_back(
+      {Level::warning,
+       fmt::format("{} moves by more than half a turn from row to row, forth and back, at {} of {} rows, over a range "
+                   "of {:.3g}: is it in rad, and sampled often enough?",
+                   coordinate.name, forth + back, n, q.maxCoeff() - q.minCoeff())});
+}
+
+// Columns that look clipped, inputs with single values that cannot be, and angles in degrees.
 void check_values(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
   const StateLayout layout = system.layout();
   const auto add = [&](Level level, const std::string& name, const Eigen::RowVectorXd& values, const char* meaning) {
@@ -295,8 +344,10 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
     }
   };
   for (int k = 0; k < layout.nu; ++k) {
-    add(Level::good, system.inputs()[static_cast<std::size_t>(k)], log.states.row(layout.u(k)),
-        "clipped? The log must have what acts");
+    const std::string& name = system.inputs()[static_cast<std::size_t>(k)];
+    const Eigen::RowVectorXd u = log.states.row(layout.u(k));
+    add(Level::good, name, u, "clipped? The log must have what acts");
+    if (std::optional<std::string> far = far_values_text(name, {u})) findings.push_back({Level::warning, *std::move(far)});
   }
   const std::vector<std::string> accelerations = system.acceleration_names();
   for (int j = 0; j < system.nq(); ++j) {
@@ -304,7 +355,11 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
         "a sensor at the end of its range?");
     const Coordinate& coordinate = system.coordinates()[static_cast<std::size_t>(j)];
     const auto q = log.states.row(layout.q(j));
-    if (!coordinate.angle || !is_wrapped_in_degrees({q.begin(), q.end()})) continue;
+    if (!coordinate.angle) continue;
+    if (!is_wrapped_in_degrees({q.begin(), q.end()})) {
+      check_turns(coordinate, log.states.row(layout.t()), q, log.states.row(layout.dq(j)), findings);
+      continue;
+    }
     findings.push_back({Level::error, fmt::format("{} jumps by 360 from row to row: it is in degrees, and an angle is in rad",
                                                   coordinate.name)});
   }
@@ -335,6 +390,8 @@ std::vector<Option> options(CheckOptions& options) {
 }
 
 std::vector<Finding> check(const Model& model, const CsvTable* log, const CheckOptions& options) {
+  if (log == nullptr && !options.columns.empty())
+    throw InputError("`map` renames columns of a log, and there is none: give `data`, or leave `map` out");
   std::vector<Finding> findings;
   check_model(model, findings);
   if (log != nullptr) {

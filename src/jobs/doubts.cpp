@@ -11,21 +11,25 @@
 
 #include "base/not_a_number.hpp"
 #include "data/evenly.hpp"
+#include "gp2/error.hpp"
 #include "inference/posterior_implementation.hpp"
+#include "jobs/rate_check.hpp"
 
 namespace gp2 {
 
 using Eigen::MatrixXd;
+using Eigen::RowVectorXd;
 using Eigen::VectorXd;
 
 namespace {
 
+using Means = std::vector<MatrixXd>;  // of the observations of each log (d × N)
+
 // The prior mean of what is observed, at its states where an input is otherwise (d × N); nothing where that is no number.
-std::optional<MatrixXd> mean_of(const Posterior& posterior, const Observations& group, const MatrixXd& states) {
-  const Prior& prior = posterior.prior();
+std::optional<MatrixXd> mean_of(const Prior& prior, const ModelValues& model, const Observations& group, const MatrixXd& states) {
   const View& view = group.view();
   MatrixXd of_view(view.size(), group.n_data());
-  const VectorXd parameters = parameters_of(view, posterior.values().parameters);
+  const VectorXd parameters = parameters_of(view, model.parameters);
   MechanicsBatch mechanics;
   evaluate_mechanics(prior, view, states, parameters, mechanics);
   if (mechanics.fault) return std::nullopt;
@@ -33,91 +37,56 @@ std::optional<MatrixXd> mean_of(const Posterior& posterior, const Observations& 
   if (values.fault) return std::nullopt;
   keep_viewed(view, values);
   const ViewValues viewed = evaluate_view(view, mechanics, states);
-  for (int i = 0; i < group.n_data(); ++i) of_view.col(i) = viewed.G(i) * values.mean.col(i);
+  for (int i = 0; i < group.n_data(); ++i) of_view.col(i) = viewed.G(i) * values.mean.col(i) + viewed.offset.col(i);
   return of_view;
 }
 
-// What an input adds to the prior mean of each of some observations, and what it would change to act some rows later.
-struct InputEffect {
-  struct Late {
-    int rows;
-    std::vector<MatrixXd> changed;  // (d × N)
-  };
-  int input;
-  std::string name;
-  std::vector<MatrixXd> added;  // (d × N)
-  std::vector<Late> late = {};
-
-  // of one log
-  [[nodiscard]] InputEffect in_log(std::size_t group) const {
-    InputEffect one{input, fmt::format("{} of log {}", name, group + 1), added};
-    for (std::size_t g = 0; g < added.size(); ++g) {
-      if (g != group) one.added[g].setZero();
-    }
-    return one;
-  }
-};
-
-double size_of(const std::vector<MatrixXd>& of_groups) {
+double size_of(const Means& of_groups) {
   double squares = 0;
   for (const MatrixXd& one : of_groups) squares += one.squaredNorm();
   return std::sqrt(squares);
 }
 
-// @param some   of the posterior's states
-// @param taken  which they are, where those follow each other in time; empty: they do not
-// @returns nothing where there is no number without the input
-std::optional<InputEffect> effect_of(const Posterior& posterior, const std::vector<Observations>& some,
-                                     const std::vector<std::vector<int>>& taken, int input) {
-  constexpr double large = 0.1;  // of what is added
-  const System& system = *posterior.prior().system;
-  const int row = system.layout().u(input);
-  const std::vector<Observations>& all = posterior.observations();
-  InputEffect effect{input, system.inputs()[static_cast<std::size_t>(input)], {}};
-  std::vector<MatrixXd> as_logged;
-  for (const Observations& group : some) {
-    MatrixXd states = group.states();
-    const auto mean = mean_of(posterior, group, states);
-    states.row(row).setZero();
-    const auto without = mean_of(posterior, group, states);
-    if (!mean || !without) return std::nullopt;
-    as_logged.push_back(*mean);
-    effect.added.emplace_back(*mean - *without);
-  }
-  for (const int rows : {1, -1, 2, -2, 4, -4, 8, -8, 16, -16}) {
-    if (taken.empty()) break;
-    InputEffect::Late late{rows, {}};
-    for (std::size_t g = 0; g < some.size(); ++g) {
-      MatrixXd states = some[g].states();
-      for (std::size_t k = 0; k < taken[g].size(); ++k) {
-        const int from = taken[g][k] - rows;
-        if (from >= 0 && from < all[g].n_data()) states(row, static_cast<Eigen::Index>(k)) = all[g].states()(row, from);
-      }
-      const auto mean = mean_of(posterior, some[g], states);
-      if (!mean) return effect;
-      late.changed.emplace_back(*mean - as_logged[g]);
-    }
-    const double share = size_of(late.changed) / size_of(effect.added);
-    if (rows == 1 && !(share < 1)) break;  // rows in no order, or too far apart to tell
-    if (share > large) effect.late.push_back(std::move(late));
-  }
-  return effect;
+Means times(Means means, double factor) {
+  for (MatrixXd& one : means) one *= factor;
+  return means;
 }
 
-Observations less(const Observations& group, const MatrixXd& values) {
-  const Observations out = group.with_values(group.values() - values);
+// Measured values, and sums over states, times a factor and with something added to each.
+Observations transformed(const Observations& group, double factor, const MatrixXd& added) {
+  const Observations out = group.with_values(factor * group.values() + added);
   if (!group.has_sums()) return out;
   std::vector<WeightedSum> sums = group.sums();
-  for (WeightedSum& sum : sums) sum.value -= values.row(sum.row).segment(sum.first, sum.weights.size()).dot(sum.weights);
+  for (WeightedSum& sum : sums)
+    sum.value = factor * sum.value + added.row(sum.row).segment(sum.first, sum.weights.size()).dot(sum.weights);
   return out.with_sums(std::move(sums));
 }
 
 // What is left to explain where an input changes the mean by so much.
-std::vector<Observations> without_change(const std::vector<Observations>& observations, const std::vector<MatrixXd>& change,
-                                         double share) {
+std::vector<Observations> without_change(const std::vector<Observations>& observations, const Means& change, double share) {
   std::vector<Observations> out;
-  for (std::size_t g = 0; g < observations.size(); ++g) out.push_back(less(observations[g], share * change[g]));
+  for (std::size_t g = 0; g < observations.size(); ++g) out.push_back(transformed(observations[g], 1, -share * change[g]));
   return out;
+}
+
+using Cost = std::function<double(const std::vector<Observations>&)>;
+
+Cost cost_under(const Prior& prior, ModelValues values) {
+  return [&prior, values = std::move(values)](const std::vector<Observations>& some) {
+    return Posterior(prior, some, values).negative_log_likelihood();
+  };
+}
+
+// Half of the squared residuals from the prior mean, in units of their deviations under some values.
+std::optional<double> misfit_of(const Prior& prior, const ModelValues& values, const std::vector<Observations>& observations) {
+  std::vector<Observations> at_mean;
+  for (const Observations& group : observations) {
+    const auto mean = mean_of(prior, values, group, group.states());
+    if (!mean) return std::nullopt;
+    at_mean.push_back(transformed(group, 0, *mean));
+  }
+  const Cost cost = cost_under(prior, values);
+  return cost(observations) - cost(at_mean);
 }
 
 // By which factor an input would have to do more for the data to be most likely.
@@ -127,44 +96,243 @@ struct InputFactor {
 };
 
 // The log likelihood is quadratic in the factor: three values tell where it is largest.
-InputFactor likeliest_factor(double cost_without, double cost_as_logged, double cost_twice) {
-  const double curvature = cost_without - 2 * cost_as_logged + cost_twice;
+InputFactor likeliest_factor(const std::vector<Observations>& observations, const Means& added, double as_logged,
+                             const Cost& cost) {
+  const double without = cost(without_change(observations, added, -1)), twice = cost(without_change(observations, added, 1));
+  const double curvature = without - 2 * as_logged + twice;
   if (!(curvature > 0)) return {};
-  const double step = 0.5 * (cost_without - cost_twice) / curvature;
+  const double step = 0.5 * (without - twice) / curvature;
   return {1 + step, 1 / std::sqrt(curvature), 0.5 * curvature * step * step};
 }
 
-// How an input acts otherwise than logged, as the data have it.
-struct Doubt {
+// An input that acts otherwise than logged.
+struct Hypothesis {
+  enum class Kind { factor, late, exchanged };
+  Kind kind;
+  Means change;     // of the mean
+  Means added;      // what the input adds to the mean then
+  int rows = 0;     // by which it is late
+  int other = -1;   // input that it is exchanged with
   double gain = 0;  // in log likelihood
-  std::string how, cause;
-  std::vector<Observations> mended;  // what is left to explain then
+  std::string text = {}, cause = {};
 };
 
-using Cost = std::function<double(const std::vector<Observations>&)>;
+// What is asked of the inputs.
+struct Doubted {
+  const Posterior& posterior;
+  const std::vector<Observations>& some;       // of the posterior's states
+  const std::vector<std::vector<int>>& taken;  // which they are, where those follow each other in time; empty: they do not
+  const FittedValues& fitted_values;
 
-// The most that can be said of an input; no gain: nothing.
-Doubt doubt_of(const InputEffect& input, const std::vector<Observations>& observations, double as_logged, const Cost& cost) {
+  /// What changes where the input rows of the states are others, and what one of them adds then. Nothing where that is no number.
+  template <typename StatesOf>
+  [[nodiscard]] std::optional<Hypothesis> hypothesis(Hypothesis::Kind kind, int input, const StatesOf& states_of) const {
+    Hypothesis out{kind, {}, {}};
+    const Prior& prior = posterior.prior();
+    for (std::size_t g = 0; g < some.size(); ++g) {
+      MatrixXd states = states_of(g);
+      const auto as_logged = mean_of(prior, posterior.values(), some[g], some[g].states());
+      const auto mean = mean_of(prior, posterior.values(), some[g], states);
+      states.row(prior.system->layout().u(input)).setZero();
+      const auto without = mean_of(prior, posterior.values(), some[g], states);
+      if (!as_logged || !mean || !without) return std::nullopt;
+      out.change.emplace_back(*mean - *as_logged);
+      out.added.emplace_back(*mean - *without);
+    }
+    return out;
+  }
+
+  [[nodiscard]] std::optional<Hypothesis> as_logged(int input) const {
+    return hypothesis(Hypothesis::Kind::factor, input, [&](std::size_t g) { return some[g].states(); });
+  }
+
+  [[nodiscard]] std::optional<Hypothesis> late(int input, int rows) const {
+    const int row = posterior.prior().system->layout().u(input);
+    auto out = hypothesis(Hypothesis::Kind::late, input, [&](std::size_t g) {
+      const MatrixXd& all = posterior.observations()[g].states();
+      MatrixXd states = some[g].states();
+      for (std::size_t k = 0; k < taken[g].size(); ++k) {
+        const Eigen::Index from = taken[g][k] - rows;
+        if (from >= 0 && from < all.cols()) states(row, static_cast<Eigen::Index>(k)) = all(row, from);
+      }
+      return states;
+    });
+    if (!out) return out;
+    out->rows = rows;
+    out->text = fmt::format("it acts {} row{} {} than logged", std::abs(rows), std::abs(rows) == 1 ? "" : "s",
+                            rows > 0 ? "later" : "earlier");
+    out->cause =
+        rows > 0 ? "It has a delay or a lag that the model lacks, or its column leads" : "Its column lags, or the others lead";
+    return out;
+  }
+
+  [[nodiscard]] std::optional<Hypothesis> exchanged(int input, int other) const {
+    const System& system = *posterior.prior().system;
+    auto out = hypothesis(Hypothesis::Kind::exchanged, input, [&](std::size_t g) {
+      MatrixXd states = some[g].states();
+      states.row(system.layout().u(input)).swap(states.row(system.layout().u(other)));
+      return states;
+    });
+    if (!out) return out;
+    out->text = fmt::format("it and {} are exchanged", system.inputs()[static_cast<std::size_t>(other)]);
+    out->cause = "Their columns are swapped, or the model has them so";
+    out->other = other;
+    return out;
+  }
+};
+
+constexpr double least_gain = 10;  // nats
+constexpr int most_late = 16;      // by which an input is taken to be late
+
+// An input, in all logs or in one.
+struct InputEffect {
+  int input;
+  std::string name;
+  Hypothesis as_logged;
+  std::vector<Hypothesis> late = {}, exchanged = {};  // with those before it
+  bool is_of_one_log = false;
+
+  [[nodiscard]] InputEffect in_log(std::size_t group) const {
+    InputEffect one{input, fmt::format("{} of log {}", name, group + 1), as_logged, {}, {}, true};
+    for (std::size_t g = 0; g < one.as_logged.added.size(); ++g) {
+      if (g != group) one.as_logged.added[g].setZero();
+    }
+    return one;
+  }
+};
+
+// Nothing where there is no number without the input.
+std::optional<InputEffect> effect_of(const Doubted& doubted, int input) {
+  constexpr double large = 0.1;  // of what is added
+  auto as_logged = doubted.as_logged(input);
+  if (!as_logged) return std::nullopt;
+  const System& system = *doubted.posterior.prior().system;
+  InputEffect effect{input, system.inputs()[static_cast<std::size_t>(input)], *std::move(as_logged)};
+  for (const int rows : {1, -1, 2, -2, 4, -4, 8, -8, most_late, -most_late}) {
+    if (doubted.taken.empty()) break;
+    std::optional<Hypothesis> late = doubted.late(input, rows);
+    if (!late) break;
+    const double share = size_of(late->change) / size_of(effect.as_logged.added);
+    if (rows == 1 && !(share < 1)) break;  // rows in no order, or too far apart to tell
+    if (share > large) effect.late.push_back(*std::move(late));
+  }
+  return effect;
+}
+
+// What the data would have an input do, the likeliest first; none where they have nothing against it.
+std::vector<Hypothesis> doubts_of(const InputEffect& input, const std::vector<Observations>& observations, double as_logged,
+                                  const Cost& cost) {
   constexpr double far = 0.5, sure = 5;  // from a factor of 1; deviations
-  const auto with_factor = [&](double factor) { return without_change(observations, input.added, factor - 1); };
-  Doubt doubt;
-  const InputFactor one = likeliest_factor(cost(with_factor(0)), as_logged, cost(with_factor(2)));
-  if (std::abs(one.factor - 1) > std::max(far, sure * one.stddev)) {
-    doubt = {one.gain, fmt::format("{:.2g} ± {:.2g} times as logged", one.factor, one.stddev),
-             "A sign or a unit is wrong, or an inertia that it moves, or it acts late", with_factor(one.factor)};
+  std::vector<Hypothesis> doubts;
+  const InputFactor one = likeliest_factor(observations, input.as_logged.added, as_logged, cost);
+  if (std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > least_gain) {
+    Hypothesis scaled = input.as_logged;
+    scaled.gain = one.gain;
+    scaled.text = fmt::format("it acts {:.2g} ± {:.2g} times as logged", one.factor, one.stddev);
+    scaled.cause = "A sign or a unit is wrong, or an inertia that it moves, or it acts late";
+    scaled.change = times(scaled.added, one.factor - 1);
+    doubts.push_back(std::move(scaled));
   }
-  for (const InputEffect::Late& late : input.late) {
-    std::vector<Observations> mended = without_change(observations, late.changed, 1);
-    const double gain = as_logged - cost(mended);
-    if (gain <= doubt.gain) continue;
-    doubt = {gain,
-             fmt::format("{} row{} {} than logged", std::abs(late.rows), std::abs(late.rows) == 1 ? "" : "s",
-                         late.rows > 0 ? "later" : "earlier"),
-             late.rows > 0 ? "It has a delay or a lag that the model lacks, or its column leads"
-                           : "Its column lags, or the others lead",
-             std::move(mended)};
+  for (const std::vector<Hypothesis>* const some : {&input.late, &input.exchanged}) {
+    for (const Hypothesis& other : *some) {
+      const double gain = as_logged - cost(without_change(observations, other.change, 1));
+      if (gain <= least_gain) continue;
+      doubts.push_back(other);
+      doubts.back().gain = gain;
+    }
   }
-  return doubt;
+  std::ranges::sort(doubts, std::ranges::greater(), &Hypothesis::gain);
+  return doubts;
+}
+
+// Whether data under a hypothesis are as those of a sound model. Latents and noise take up what an input does otherwise: they are
+// fitted anew. Then a sound hypothesis leaves little of the misfit, and the input acts as it says.
+class Explanation {
+ public:
+  Explanation(const Doubted& doubted, const std::vector<Observations>& observations, const Hypothesis& hypothesis)
+      : observations_(observations),
+        prior_(doubted.posterior.prior()),
+        hypothesis_(hypothesis),
+        mended_(without_change(observations, hypothesis.change, 1)),
+        values_(doubted.fitted_values(mended_)),
+        cost_(cost_under(prior_, values_)),
+        left_(cost_(mended_)) {}
+
+  [[nodiscard]] bool is_sound() const {
+    // a wrong inertia is mended by a factor in part alone; an input that is one row off leaves more than noise
+    const bool is_factor = hypothesis_.kind == Hypothesis::Kind::factor;
+    const double least = is_factor ? 0.5 : 0.8;  // share of the misfit
+    constexpr double near = 0.25;                // from a factor of 1
+    const auto misfit = misfit_of(prior_, values_, observations_);
+    if (!misfit || !(cost_(observations_) - left_ > least * *misfit)) return false;
+    return is_factor || std::abs(likeliest_factor(mended_, hypothesis_.added, left_, cost_).factor - 1) < near;
+  }
+  /// How much likelier the data are under another hypothesis.
+  [[nodiscard]] double gain_of(const Hypothesis& other) const {
+    return left_ - cost_(without_change(observations_, other.change, 1));
+  }
+
+ private:
+  const std::vector<Observations>& observations_;
+  const Prior& prior_;
+  const Hypothesis& hypothesis_;
+  std::vector<Observations> mended_;
+  ModelValues values_;  // fitted to these
+  Cost cost_;
+  double left_;
+};
+
+// By how many rows an input is late, under what is fitted to it being late; nothing: no delay explains the data.
+std::optional<Hypothesis> sound_delay(const Doubted& doubted, const std::vector<Observations>& observations, int input,
+                                      Hypothesis late) {
+  constexpr int most_fits = 4;
+  const double gain = late.gain;
+  for (int k = 0; k < most_fits; ++k) {
+    const Explanation explanation(doubted, observations, late);
+    std::optional<Hypothesis> best;
+    for (int rows = -most_late; rows <= most_late; ++rows) {
+      if (rows == 0 || rows == late.rows) continue;
+      std::optional<Hypothesis> other = doubted.late(input, rows);
+      if (!other) continue;
+      other->gain = explanation.gain_of(*other);
+      if (other->gain > (best ? best->gain : 0)) best = std::move(other);
+    }
+    if (!best) {
+      if (std::abs(late.rows) == most_late || !explanation.is_sound()) return std::nullopt;
+      late.gain = gain;
+      return late;
+    }
+    late = *std::move(best);
+  }
+  return std::nullopt;
+}
+
+// What explains the data that deny an input; nothing: neither a delay, nor a factor, nor an exchange with another input.
+std::optional<Hypothesis> explanation_of(const Doubted& doubted, const std::vector<Observations>& observations,
+                                         const InputEffect& input, std::vector<Hypothesis> doubts,
+                                         const std::vector<InputEffect>& others, double as_logged, const Cost& cost) {
+  for (const InputEffect& other : others) {
+    if (input.is_of_one_log || other.is_of_one_log || other.input == input.input) continue;
+    if (std::ranges::find(doubts, other.input, &Hypothesis::other) != doubts.end()) continue;
+    std::optional<Hypothesis> exchanged = doubted.exchanged(input.input, other.input);
+    if (!exchanged) continue;
+    exchanged->gain = as_logged - cost(without_change(observations, exchanged->change, 1));
+    if (exchanged->gain > least_gain) doubts.push_back(*std::move(exchanged));
+  }
+  std::ranges::sort(doubts, std::ranges::greater(), &Hypothesis::gain);
+  bool is_late_asked = false;
+  for (const Hypothesis& one : doubts) {
+    try {
+      if (one.kind != Hypothesis::Kind::late) {
+        if (Explanation(doubted, observations, one).is_sound()) return one;
+      } else if (!std::exchange(is_late_asked, true)) {
+        if (auto delay = sound_delay(doubted, observations, input.input, one)) return delay;
+      }
+    } catch (const NumericalError&) {
+      continue;  // what cannot be fitted explains nothing
+    }
+  }
+  return std::nullopt;
 }
 
 // The same, of which nothing was measured in one log, or in all others.
@@ -181,6 +349,13 @@ std::vector<Observations> with_log(const std::vector<Observations>& observations
 bool can_contradict(const std::vector<Observations>& observations, std::size_t log) {
   const auto tells = [](const Observations& group) { return group.view().is_of_ddq() && !group.values().array().isNaN().all(); };
   return tells(observations[log]) && std::ranges::count_if(observations, tells) > 1;
+}
+
+// A row of the states of each log.
+std::vector<RowVectorXd> values_of(const std::vector<Observations>& observations, int row) {
+  std::vector<RowVectorXd> values;
+  for (const Observations& group : observations) values.emplace_back(group.states().row(row));
+  return values;
 }
 
 // By how much a log and the others are likelier under functions of their own than under one.
@@ -217,14 +392,6 @@ void note_contradiction(const Posterior& posterior, std::size_t log, double gain
       log + 1, gain, cause));
 }
 
-constexpr double least_gain = 10;  // nats
-
-Cost cost_under(const Prior& prior, ModelValues values) {
-  return [&prior, values = std::move(values)](const std::vector<Observations>& some) {
-    return Posterior(prior, some, values).negative_log_likelihood();
-  };
-}
-
 // A fit takes up what acts in a log whose input was lost, by a function that bends as it must: the others are fitted without it.
 void note_lost_inputs(const Posterior& posterior, std::vector<Observations>& observations, const FittedValues& fitted_values,
                       std::vector<std::string>& notes) {
@@ -239,43 +406,65 @@ void note_lost_inputs(const Posterior& posterior, std::vector<Observations>& obs
   }
 }
 
+void note_unexplained(const std::vector<std::string>& inputs, double gain, std::vector<std::string>& notes) {
+  if (inputs.empty()) return;
+  const bool is_one = inputs.size() == 1;
+  notes.push_back(fmt::format(
+      "warning: the model does not explain what the input{} {} {}, by {:.2g} in log likelihood, and no delay, factor or "
+      "exchange of inputs would. The force, an inertia or a coordinate is wrong, or something acts that the model does "
+      "not know",
+      is_one ? "" : "s", fmt::join(inputs, ", "), is_one ? "does" : "do", gain));
+}
+
 // A wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be.
-void note_doubts(const Posterior& posterior, std::vector<Observations> observations, std::vector<InputEffect> inputs,
-                 bool asks_logs, std::vector<std::string>& notes) {
-  const Cost cost = cost_under(posterior.prior(), posterior.values());
+void note_doubts(const Doubted& doubted, std::vector<Observations> observations, std::vector<InputEffect> inputs, bool asks_logs,
+                 std::vector<std::string>& notes) {
+  const Cost cost = cost_under(doubted.posterior.prior(), doubted.posterior.values());
+  std::vector<std::string> unexplained;
+  double unexplained_gain = 0;
   for (;;) {
     const double as_logged = cost(observations);
-    Doubt worst;
-    worst.gain = least_gain;
+    std::vector<Hypothesis> doubts;
+    double gain = least_gain;
     std::ptrdiff_t of_input = -1, of_log = -1;
     for (std::size_t k = 0; k < inputs.size(); ++k) {
-      Doubt doubt = doubt_of(inputs[k], observations, as_logged, cost);
-      if (!(doubt.gain > worst.gain)) continue;
-      worst = std::move(doubt);
+      std::vector<Hypothesis> of_one = doubts_of(inputs[k], observations, as_logged, cost);
+      if (of_one.empty() || !(of_one.front().gain > gain)) continue;
+      doubts = std::move(of_one);
+      gain = doubts.front().gain;
       of_input = static_cast<std::ptrdiff_t>(k);
     }
     for (std::size_t g = 0; g < observations.size() && asks_logs; ++g) {
       if (!can_contradict(observations, g)) continue;
-      const double gain = gain_of_contradiction(observations, g, as_logged, cost);
-      if (!(gain > worst.gain)) continue;
-      worst.gain = gain;
+      const double of_one = gain_of_contradiction(observations, g, as_logged, cost);
+      if (!(of_one > gain)) continue;
+      gain = of_one;
       of_log = static_cast<std::ptrdiff_t>(g);
     }
     if (of_log >= 0) {
-      note_contradiction(posterior, static_cast<std::size_t>(of_log), worst.gain, notes);
+      note_contradiction(doubted.posterior, static_cast<std::size_t>(of_log), gain, notes);
       observations = with_log(observations, static_cast<std::size_t>(of_log), /*alone=*/false);
     } else if (of_input >= 0) {
-      const InputEffect& input = inputs[static_cast<std::size_t>(of_input)];
-      notes.push_back(fmt::format(
-          "warning: the data deny the input {}: they are most likely where it acts {}, by {:.2g} in log likelihood. {}",
-          input.name, worst.how, worst.gain, worst.cause));
-      observations = std::move(worst.mended);
+      const InputEffect input = inputs[static_cast<std::size_t>(of_input)];
+      const auto explanation = explanation_of(doubted, observations, input, doubts, inputs, as_logged, cost);
+      if (explanation) {
+        notes.push_back(
+            fmt::format("warning: the data deny the input {}: they are most likely where {}, by {:.2g} in log likelihood. {}",
+                        input.name, explanation->text, explanation->gain, explanation->cause));
+      } else {
+        unexplained.push_back(input.name);
+        unexplained_gain = std::max(unexplained_gain, gain);
+      }
+      observations = without_change(observations, explanation ? explanation->change : doubts.front().change, 1);
       // what else is said of it is said of an input that acts so
-      std::erase_if(inputs, [said = input.input](const InputEffect& one) { return one.input == said; });
+      const auto is_said = [&](int one) { return one == input.input || (explanation && one == explanation->other); };
+      std::erase_if(inputs, [&](const InputEffect& one) { return is_said(one.input); });
+      for (InputEffect& one : inputs) std::erase_if(one.exchanged, [&](const Hypothesis& with) { return is_said(with.other); });
     } else {
-      return;
+      break;
     }
   }
+  note_unexplained(unexplained, unexplained_gain, notes);
 }
 
 }  // namespace
@@ -294,7 +483,7 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
   const bool asks = !prior.is_nonlinear() && !(of_windows && n_states(all) * system.nq() > 2 * enough);
   const bool asks_logs = asks && !of_windows && all.size() > 1 && all.size() <= most_logs;
   const int n_some = enough / system.nq();
-  std::vector<Observations> some = of_windows ? all : evenly(all, n_some);
+  const std::vector<Observations> some = of_windows ? all : evenly(all, n_some);
   // of many states some are kept, which do not follow each other
   const bool are_all = posterior.n_states() == n_states(all);
   const auto taken = has_row_order && are_all && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
@@ -303,7 +492,9 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
   const auto is_learned = [&](int row) {
     return std::any_of(prior.latents.begin(), prior.latents.end(), [&](const Latent& one) { return one.features->reads(row); });
   };
+  const Doubted doubted{posterior, some, taken, fitted_values};
   std::vector<InputEffect> inputs;
+  bool has_far_values = false;
   for (int j = 0; j < layout.nu && prior.mean == Prior::Mean::force; ++j) {
     const int row = layout.u(j);
     if (!force[static_cast<std::size_t>(row)]) continue;
@@ -311,18 +502,29 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
     if (!any([&](const auto& group) { return (group.states().row(row).array() != first).any(); })) {
       notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?",
                                   system.inputs()[static_cast<std::size_t>(j)], first));
+    } else if (const auto far = far_values_text(system.inputs()[static_cast<std::size_t>(j)], values_of(all, row))) {
+      notes.push_back("warning: " + *far);
+      has_far_values = true;
     } else if (asks && !elsewhere[static_cast<std::size_t>(row)] && !is_learned(row)) {
-      if (std::optional<InputEffect> effect = effect_of(posterior, some, taken, j)) inputs.push_back(*std::move(effect));
+      std::optional<InputEffect> effect = effect_of(doubted, j);
+      if (!effect) continue;
+      for (const InputEffect& before : inputs) {
+        if (auto exchanged = doubted.exchanged(j, before.input)) effect->exchanged.push_back(*std::move(exchanged));
+      }
+      inputs.push_back(*std::move(effect));
     }
   }
+  // they make all else look wrong
+  if (has_far_values) return;
   const std::size_t n_inputs = inputs.size();
   for (std::size_t k = 0; k < n_inputs && asks_logs; ++k) {
     for (std::size_t g = 0; g < all.size(); ++g) {
       if (all[g].view().is_of_ddq()) inputs.push_back(inputs[k].in_log(g));
     }
   }
-  if (asks_logs) note_lost_inputs(posterior, some, fitted_values, notes);
-  note_doubts(posterior, std::move(some), std::move(inputs), asks_logs, notes);
+  std::vector<Observations> observations = some;
+  if (asks_logs) note_lost_inputs(posterior, observations, fitted_values, notes);
+  note_doubts(doubted, std::move(observations), std::move(inputs), asks_logs, notes);
 }
 
 }  // namespace gp2

@@ -3,8 +3,11 @@
 #include <algorithm>
 #include <cmath>
 #include <exception>
+#include <iterator>
 #include <numeric>
 #include <optional>
+#include <set>
+#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -18,6 +21,7 @@
 #include "gp2/jobs/actuator_fit.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_time.hpp"
+#include "inference/cross_validation.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/doubts.hpp"
 #include "jobs/fit_notes.hpp"
@@ -272,7 +276,9 @@ std::vector<Option> options(FitRequest& request) {
                            largest_exact_size, most_inducing_variables),
                "auto"},
               {"train_on", &request.train_on, "N",
-               "find the hyperparameters from so many rows, evenly taken from all logs together, and learn from all under these",
+               "find hyperparameters and estimated parameters from so many rows, evenly taken from all logs together, and learn "
+               "from "
+               "all under these: quick, with deviations that may be too small",
                "all rows"},
               threads_option(request.threads),
               not_recorded({"checkpoint", &request.checkpoint, "FILE",
@@ -354,6 +360,7 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
   FitJob job = job_of(std::move(request), std::move(problem));
   job.file.logs = fit.logs;
+  job.file.notes = fit.notes;
   job.actuators = fit.report.actuators;
   return job;
 }
@@ -396,24 +403,31 @@ bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observ
 
 namespace {
 
-// The posterior to judge a fit by: of a robust one without the values that it distrusts, which are no measure of its predictions.
-// Inducing points keep what all values said in one sum, from which none can be taken.
-Posterior without_distrusted(const Posterior& posterior, const FitReport& report) {
-  if (report.distrusted.empty() || report.inducing) return posterior;
-  std::vector<Observations> trusted = posterior.observations();
-  std::vector<Eigen::MatrixXd> values;
-  for (const Observations& group : trusted) values.push_back(group.values());
-  for (const DistrustedValue& one : report.distrusted) {
-    values[static_cast<std::size_t>(one.group)](one.row, one.state) = not_a_number;
+// What to judge a fit by: of a robust one without the values that it distrusts, which are no measure of its predictions. Of many states
+// every so manieth is kept, whose numbers and lines are those of the log.
+JudgedData judged_data(const Posterior& posterior, const FitReport& report, const std::vector<std::vector<int>>& lines = {}) {
+  JudgedData judged{posterior.observations(), {}};
+  const std::shared_ptr<const InducingSummary> summary = posterior.summary();
+  const int step = summary ? summary->kept.step : 1;
+  for (const std::vector<int>& of_log : lines) {
+    std::vector<int>& kept = judged.lines.emplace_back();
+    for (std::size_t i = 0; i < of_log.size(); i += static_cast<std::size_t>(step)) kept.push_back(of_log[i]);
   }
-  for (std::size_t g = 0; g < trusted.size(); ++g) trusted[g] = trusted[g].with_values(values[g]);
-  return posterior_of(posterior.prior(), trusted, report);
+  for (std::size_t g = 0; g < judged.observations.size(); ++g) {
+    Eigen::MatrixXd values = judged.observations[g].values();
+    for (const DistrustedValue& one : report.distrusted) {
+      if (one.group == static_cast<int>(g) && one.state % step == 0) values(one.row, one.state / step) = not_a_number;
+    }
+    if (!report.distrusted.empty()) judged.observations[g] = judged.observations[g].with_values(std::move(values));
+  }
+  return judged;
 }
 
 }  // namespace
 
 CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
-  CrossValidation scores = cross_validate(without_distrusted(posterior, fit.report), keeps_row_order(fit, fit.n_states()));
+  CrossValidation scores =
+      cross_validate(posterior, judged_data(posterior, fit.report).observations, keeps_row_order(fit, fit.n_states()));
   if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
   return scores;
 }
@@ -427,7 +441,7 @@ struct Worth {
 
   // As many rows as it takes for correlated residuals to forget, but not so many that hardly any are left.
   Worth(const std::vector<TrainingResidual>& residuals, const std::vector<Observations>& observations)
-      : rows(observations.size(), 1), text(correlated_text(residuals)) {
+      : rows(observations.size(), 1), text((last_beyond_noise(residuals) ? "warning: " : "") + correlated_text(residuals)) {
     constexpr double forgotten = 0.3;
     constexpr int fewest = 40;
     for (const TrainingResidual& one : residuals) {
@@ -447,6 +461,7 @@ void save_checkpoint(const FitJob& job, const FitReport& report, const std::vect
   FitFile file = job.file;
   file.observations = n_states(observations) > KeptStates::most ? evenly(observations, KeptStates::most) : observations;
   file.report = report;
+  file.notes.reset();
   file.report.actuators = job.actuators;
   if (n_states(file.observations) < n_states(job.problem.observations)) file.report.termination = has_some_rows;
   file.write(job.checkpoint);
@@ -484,6 +499,13 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   if (!unsaved.empty()) outcome.notes.push_back(fmt::format("warning: a checkpoint was not saved: {}", unsaved));
   for (std::string& note : notes_of(result.report, outcome.posterior)) outcome.notes.push_back(std::move(note));
   if (result.report.inducing) add_inducing_note(*result.report.inducing, outcome.notes);
+  if (const int n_all = n_states(job.problem.observations);
+      options.n_train > 0 && options.n_train < n_all && options.max_iterations > 0) {
+    outcome.notes.push_back(
+        fmt::format("hyperparameters and estimated parameters come from {} of {} rows (`train_on`): deviations "
+                    "may be too small; more rows, or all, tell more",
+                    options.n_train, n_all));
+  }
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
     if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);
     // a fit that has taken hours is not lost to what is said of it
@@ -492,13 +514,13 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       add_constraint_note(outcome.posterior, outcome.notes);
       add_window_note(outcome.posterior, outcome.notes);
       const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
-      const Posterior judged = without_distrusted(outcome.posterior, result.report);
-      outcome.cross_validation = cross_validate(judged, has_row_order);
+      const JudgedData judged = judged_data(outcome.posterior, result.report, job.problem.lines);
+      outcome.cross_validation = cross_validate(outcome.posterior, judged.observations, has_row_order);
       if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
       if (result.report.iterations > 0) add_noise_notes(outcome.posterior, outcome.notes);
-      add_residual_notes(judged, outcome.cross_validation->residuals, outcome.notes);
-      add_pile_up_notes(judged.observations(), *judged.prior().system, outcome.notes);
-      add_stretch_note(*outcome.cross_validation, outcome.notes);
+      add_residual_notes(outcome.posterior, judged, outcome.cross_validation->residuals, outcome.notes);
+      add_pile_up_notes(judged.observations, *outcome.posterior.prior().system, outcome.notes);
+      add_stretch_note(*outcome.cross_validation, outcome.notes, outcome.posterior.prior());
       FitOptions quick;
       quick.n_restarts = 1;
       quick.max_iterations = 50;
@@ -559,14 +581,19 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
                        const std::atomic<bool>* stop) {
   const std::vector<Observations>& all = job.problem.observations;
   int n_all = 0, n_taken = 0;
+  std::vector<std::vector<int>> lines(all.size());
   const FitFile file = with_states(job.file, all, [&](std::size_t g) {
     std::vector<int> taken;
-    for (int i = worth.rows[g] / 2; i < all[g].n_data(); i += worth.rows[g]) taken.push_back(i);
+    for (int i = worth.rows[g] / 2; i < all[g].n_data(); i += worth.rows[g]) {
+      taken.push_back(i);
+      if (!job.problem.lines[g].empty()) lines[g].push_back(job.problem.lines[g][static_cast<std::size_t>(i)]);
+    }
     n_all += all[g].n_data();
     n_taken += static_cast<int>(taken.size());
     return taken;
   });
   FitJob fewer = prepare_fit_again(file, job.options.n_threads);
+  fewer.problem.lines = std::move(lines);
   fewer.actuators = job.actuators;
   fewer.options.ranks = job.options.ranks;
   fewer.checkpoint = job.checkpoint;
@@ -595,10 +622,20 @@ std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>
   return Worth(outcome.cross_validation->residuals, all);
 }
 
-}  // namespace
+// What all rows say takes the place of what fewer of them say of the same: notes that begin alike.
+void take_notes_of_all(std::vector<std::string> of_all, std::vector<std::string>& notes) {
+  const auto subject = [](const std::string& note) {
+    const std::size_t begin = note.starts_with("warning: ") ? std::string_view("warning: ").size() : 0;
+    return note.substr(begin, note.find(": ", begin) - begin);
+  };
+  std::set<std::string> known;
+  for (const std::string& note : of_all) known.insert(subject(note));
+  std::erase_if(notes, [&](const std::string& note) { return known.contains(subject(note)); });
+  notes.insert(notes.begin(), std::make_move_iterator(of_all.begin()), std::make_move_iterator(of_all.end()));
+}
 
-FitOutcome run_fit(const FitJob& asked, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
-  const FitJob job = with_actuators(asked, stop);
+FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<void(const Progress&)>& progress,
+                                       const std::atomic<bool>* stop) {
   if (!job.thin) return run_once(job, progress, stop);
   std::optional<FitOutcome> all;
   try {
@@ -608,12 +645,14 @@ FitOutcome run_fit(const FitJob& asked, const std::function<void(const Progress&
     all = run_once(job, progress, stop);
     if (!all->cross_validation) return *all;
     const Worth worth(all->cross_validation->residuals, job.problem.observations);
-    if (!worth.is_less()) return *all;
+    const JudgedData judged = judged_data(all->posterior, all->file.report, job.problem.lines);
+    // that a constraint does not hold is no error that lasts
+    if (!worth.is_less() || denies_constraints(all->posterior, judged)) return *all;
     FitOutcome fewer = run_thinned(job, worth, progress, stop);
     if (fewer.file.report.termination == FitReport::interrupted) return *all;
     std::vector<std::string> notes;
-    add_residual_notes(all->posterior, all->cross_validation->residuals, notes);
-    fewer.notes.insert(fewer.notes.begin(), notes.begin(), notes.end());
+    add_residual_notes(all->posterior, judged, all->cross_validation->residuals, notes);
+    take_notes_of_all(std::move(notes), fewer.notes);
     return fewer;
   } catch (const Error& error) {
     if (!job.unaffordable.empty()) throw;
@@ -622,6 +661,16 @@ FitOutcome run_fit(const FitJob& asked, const std::function<void(const Progress&
       all->notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));
     return *all;
   }
+}
+
+}  // namespace
+
+FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+  FitOutcome outcome = run_for_what_rows_are_worth(with_actuators(job, stop), progress, stop);
+  // a fit again from its file keeps what was said with the logs at hand
+  outcome.file.notes = job.file.notes.value_or(outcome.notes);
+  if (!outcome.cross_validation) outcome.file.notes.reset();
+  return outcome;
 }
 
 }  // namespace gp2

@@ -11,6 +11,7 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/training/robust.hpp"
+#include "inference/cross_validation.hpp"
 #include "jobs/rate_check.hpp"
 
 namespace gp2 {
@@ -70,6 +71,17 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
   }
 }
 
+namespace {
+
+// Where a state stands: "line 9 of log 2", or its row where no line is known.
+std::string place_of(const std::vector<std::vector<int>>& lines, std::size_t group, std::size_t state, bool has_one_log) {
+  const bool has_line = group < lines.size() && state < lines[group].size();
+  return fmt::format("{} {}{}", has_line ? "line" : "row", has_line ? lines[group][state] : static_cast<int>(state) + 1,
+                     has_one_log ? "" : fmt::format(" of log {}", group + 1));
+}
+
+}  // namespace
+
 std::string gross_errors_text(const FitProblem& problem) {
   constexpr double few = 0.05;  // of a column's values
   constexpr std::size_t most_shown = 6;
@@ -84,11 +96,8 @@ std::string gross_errors_text(const FitProblem& problem) {
       if (static_cast<double>(n - n_near) > few * static_cast<double>(n)) continue;
       for (Eigen::Index i = 0; i < near.cols(); ++i) {
         if (std::isnan(group.values()(k, i)) || !std::isnan(near(k, i))) continue;
-        const auto state = static_cast<std::size_t>(i);
-        const std::string line =
-            state < problem.lines[g].size() ? fmt::format("line {}", problem.lines[g][state]) : fmt::format("row {}", i + 1);
-        far.push_back(fmt::format("{} = {:.6g} in {}{}", names[static_cast<std::size_t>(k)], group.values()(k, i), line,
-                                  problem.observations.size() > 1 ? fmt::format(" of log {}", g + 1) : ""));
+        far.push_back(fmt::format("{} = {:.6g} in {}", names[static_cast<std::size_t>(k)], group.values()(k, i),
+                                  place_of(problem.lines, g, static_cast<std::size_t>(i), problem.observations.size() == 1)));
       }
     }
   }
@@ -105,10 +114,14 @@ namespace {
 
 // The accelerations of a group against A ddq = b. An estimated noise takes up what denies a constraint: beside it they are judged by
 // the terms that should cancel, as where no noise is known. A row of one term alone has nothing to cancel, and a soft one need not.
-std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, std::size_t group) {
-  const Observations& of = posterior.observations()[group];
+std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, const JudgedData& judged, std::size_t group) {
+  const Observations& of = judged.observations[group];
   const Prior& prior = prior_of(posterior.prior(), of.view());
-  std::vector<ConstraintResidual> residuals = constraint_residuals(posterior, group);
+  const VectorXd noise_stddev = posterior.noise_stddev(group);
+  MatrixXd noise(of.view().size(), of.n_data());
+  for (int i = 0; i < of.n_data(); ++i) noise.col(i) = of.noise().at(noise_stddev, i);
+  std::vector<ConstraintResidual> residuals =
+      constraint_residuals(posterior, of.view().other_system, of.states(), of.view().rows, of.values(), noise);
   if (!of.noise().is_estimated() || of.has_sums() || prior.system->has_constraint_noise()) return residuals;
   constexpr double rounding = 1e-9;
   for (ConstraintResidual& one : residuals) {
@@ -118,8 +131,7 @@ std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, s
 }
 
 // Where measured accelerations, or the velocities beside them, are not the rates of what they should be.
-void add_rate_notes(const Posterior& posterior, std::size_t group, std::vector<std::string>& notes) {
-  const Observations& of = posterior.observations()[group];
+void add_rate_notes(const Posterior& posterior, const Observations& of, std::vector<std::string>& notes) {
   const System& system = *prior_of(posterior.prior(), of.view()).system;
   MatrixXd accelerations = MatrixXd::Constant(system.nq(), of.n_data(), not_a_number);
   accelerations(of.view().rows, Eigen::all) = of.values();
@@ -128,94 +140,197 @@ void add_rate_notes(const Posterior& posterior, std::size_t group, std::vector<s
 
 }  // namespace
 
-void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
-                        std::vector<std::string>& notes) {
-  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
-    if (!posterior.observations()[g].view().is_of_ddq()) continue;
+namespace {
+
+// The accelerations of each log against the constraints.
+void add_constraint_residual_notes(const Posterior& posterior, const JudgedData& judged, std::vector<std::string>& notes) {
+  for (std::size_t g = 0; g < judged.observations.size(); ++g) {
+    if (!judged.observations[g].view().is_of_ddq()) continue;
     const std::size_t n_before = notes.size();
-    for (const ConstraintResidual& one : residuals_to_judge(posterior, g)) {
-      if (one.is_too_large()) notes.push_back("warning: " + one.text());
+    for (ConstraintResidual& one : residuals_to_judge(posterior, judged, g)) {
+      if (!one.is_too_large()) continue;
+      for (int& state : one.worst) {  // numbers of rows below the header
+        const auto at = static_cast<std::size_t>(state);
+        if (g < judged.lines.size() && at < judged.lines[g].size()) state = judged.lines[g][at] - 2;
+      }
+      notes.push_back("warning: " + one.text());
     }
-    if (notes.size() > n_before) add_rate_notes(posterior, g, notes);
+    if (notes.size() > n_before) add_rate_notes(posterior, judged.observations[g], notes);
   }
-  std::vector<std::string> large, small;
+}
+
+// Single values that are far off; those of columns of which many are not counted.
+void add_far_value_note(const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
+                        std::vector<std::string>& notes) {
+  constexpr double much = 3;  // times the noise, or what the fit is sure of
   const TrainingResidual* farthest = nullptr;
   int n_far = 0;
   for (const TrainingResidual& one : residuals) {
-    const Observations& group = posterior.observations()[one.group];
-    if (one.is_too_small() && !group.noise().is_estimated() && !group.has_sums())
-      small.push_back(fmt::format("{} ({:.2g} of the noise)", one.output, one.rms_in_noise));
-    if (!one.is_too_large()) {
-      n_far += one.n_far;
-      if (one.n_far > 0 && (farthest == nullptr || one.farthest > farthest->farthest)) farthest = &one;
-      continue;
-    }
-    large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
+    if (one.is_too_large()) continue;
+    n_far += one.n_far;
+    if (one.n_far > 0 && (farthest == nullptr || one.farthest > farthest->farthest)) farthest = &one;
   }
-  if (!large.empty()) {
-    notes.push_back(
-        fmt::format("warning: values lie farther than noise from what all others predict: {}: the noise is stated too small, a "
-                    "column is wrong or lags, or the constraints or features miss something; see gp2 check and gp2 report",
-                    fmt::join(large, ", ")));
-  }
-  if (farthest != nullptr) {
-    const std::string where = farthest->farthest_state < 0 ? ""
-                                                           : fmt::format(", at row {} of what is learned from log {}",
-                                                                         farthest->farthest_state + 1, farthest->group + 1);
-    notes.push_back(fmt::format(
-        "warning: {} of the values lie six deviations or more from what all others predict, up to {:.2g} ({}{}): outliers of "
-        "the log, or rare states of which the others tell nothing while the fit is sure of itself; see `robust`",
-        n_far, farthest->farthest, farthest->output, where));
-  }
-  if (small.empty()) return;
+  if (farthest == nullptr) return;
+  const std::string where = farthest->farthest_state < 0 ? ""
+                                                         : ", in " + place_of(judged.lines, farthest->group,
+                                                                              static_cast<std::size_t>(farthest->farthest_state),
+                                                                              judged.observations.size() == 1);
+  const bool is_open = farthest->rms_in_noise > much * std::max(1.0, farthest->rms);
   notes.push_back(fmt::format(
-      "values lie closer to what all others predict than the noise that is stated lets them: {}: it is stated too large, and "
-      "deviations are, or rows share their errors, as smoothed ones do; `noise_std=estimate` finds it",
-      fmt::join(small, ", ")));
-}
-
-namespace {
-
-// Whether stretches that were left out are predicted much worse than the noise and rows left out one by one, or somewhat worse while
-// the fit is too sure of itself. What the model lacks is taken up between rows that are known, and told by stretches that are not.
-bool predicts_stretches_worse(const CrossValidation& of) {
-  constexpr double several = 3, worth_a_word = 0.01;  // times the noise or the error of single rows; of the spread
-  constexpr double somewhat = 1.3, low_coverage = 0.9;
-  constexpr int enough = 100;  // rows, for a coverage
-  if (!of.stretches) return false;
-  const double usual = std::max(of.nrmse_of_noise, of.one_by_one.nrmse), error = of.stretches->nrmse;
-  return (error > several * usual && error > worth_a_word) ||
-         (error > somewhat * usual && of.stretches->coverage95 < low_coverage && of.stretches->n >= enough);
+      "warning: {} of the values lie six deviations or more from what all others predict, up to {:.2g} ({}{}): {}outliers of "
+      "the log, or rare states of which the others tell nothing while the fit is sure of itself; see `robust`",
+      n_far, farthest->farthest, farthest->output, where,
+      is_open ? "a mass, a length or a force that is wrong, as all values are predicted far worse than the noise; or " : ""));
 }
 
 }  // namespace
 
-void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes) {
-  if (!cross_validation.predicts_little()) {
-    if (!predicts_stretches_worse(cross_validation)) return;
-    const Evaluation::Part& stretches = *cross_validation.stretches;
-    notes.push_back(fmt::format(
-        "stretches of the log that were left out are predicted worse than rows left out one by one: nrmse {:.2g}, not {:.2g}, of "
-        "which the noise makes {:.2g}; the intervals of 95 % hold {:.0f} %. Something acts otherwise than the model has it (an "
-        "input that "
-        "is clipped, late or scaled, an inertia that is off), or the rows are too few, or of one motion, for what the model "
-        "leaves open",
-        stretches.nrmse, cross_validation.one_by_one.nrmse, cross_validation.nrmse_of_noise, 100 * stretches.coverage95));
-    return;
+bool denies_constraints(const Posterior& posterior, const JudgedData& judged) {
+  for (std::size_t g = 0; g < judged.observations.size(); ++g) {
+    if (!judged.observations[g].view().is_of_ddq()) continue;
+    if (std::ranges::any_of(residuals_to_judge(posterior, judged, g), &ConstraintResidual::is_too_large)) return true;
   }
-  notes.push_back(fmt::format(
-      "{}of stretches of the log that it has not seen the fit says little: nrmse {:.2g}, of which the noise makes {:.2g}. An "
-      "input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves open",
-      cross_validation.predicts_nothing() ? "warning: " : "", cross_validation.stretches->nrmse,
-      cross_validation.nrmse_of_noise));
+  return false;
+}
+
+void add_residual_notes(const Posterior& posterior, const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
+                        std::vector<std::string>& notes) {
+  add_constraint_residual_notes(posterior, judged, notes);
+  std::vector<std::string> large, small;
+  for (const TrainingResidual& one : residuals) {
+    const Observations& group = judged.observations[one.group];
+    if (one.is_too_small() && !group.noise().is_estimated() && !group.has_sums())
+      small.push_back(fmt::format("{} ({:.2g} of the noise)", one.output, one.rms_in_noise));
+    if (one.is_too_large())
+      large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
+  }
+  if (!large.empty()) {
+    notes.push_back(fmt::format(
+        "warning: values lie farther than noise from what all others predict: {}: the noise is stated too small, a "
+        "column is wrong or lags, a mass, a length or a force is wrong, or the constraints or features miss something; "
+        "see gp2 check and gp2 report",
+        fmt::join(large, ", ")));
+  }
+  add_far_value_note(judged, residuals, notes);
+  if (small.empty()) return;
+  notes.push_back(
+      fmt::format("values lie closer to what all others predict than the noise that is stated lets them: {}: it is stated too "
+                  "large, or rows share their errors, as smoothed ones do; `noise_std=estimate` finds it",
+                  fmt::join(small, ", ")));
+}
+
+namespace {
+
+constexpr int enough_rows = 100;  // for a verdict on the model
+
+bool has_far_values(const CrossValidation& of) {
+  return std::ranges::any_of(of.residuals, [](const TrainingResidual& one) { return one.n_far > 0; });
+}
+
+// Whether stretches that were left out are predicted much worse than the noise and rows left out one by one, or somewhat worse while
+// the fit is too sure of itself. What the model lacks is taken up between rows that are known, and told by stretches that are not.
+bool predicts_stretches_worse(const CrossValidation& of) {
+  constexpr double several = 3, twice = 2, worth_a_word = 0.01;  // times the noise; the error of single rows; of the spread
+  constexpr double somewhat = 1.3, low_coverage = 0.9;
+  if (!of.stretches) return false;
+  const Evaluation::Part &rows = of.one_by_one, &stretches = *of.stretches;
+  const double error = stretches.nrmse;
+  if (error > std::max({several * of.nrmse_of_noise, twice * rows.nrmse, worth_a_word})) return true;
+  if (error > somewhat * std::max(of.nrmse_of_noise, rows.nrmse) && stretches.coverage95 < low_coverage) {
+    return stretches.n >= enough_rows;
+  }
+  return is_coverage_low(stretches.coverage95, stretches.n) && !is_coverage_low(rows.coverage95, rows.n) && error > rows.nrmse;
+}
+
+// Whether even between others rows are predicted much worse than the noise, and neither single values nor a column are said to be.
+bool predicts_rows_badly(const CrossValidation& of) {
+  constexpr double several = 3, worth_a_word = 0.1;  // times the noise; of the spread
+  return of.one_by_one.nrmse > std::max(several * of.nrmse_of_noise, worth_a_word) && !has_far_values(of) &&
+         std::ranges::none_of(of.residuals, &TrainingResidual::is_too_large);
+}
+
+// Whether what the fit leaves open is more than a sound model would of as many rows: it errs even between them, and far more beyond.
+bool denies_model(const CrossValidation& of, double error) {
+  constexpr double between = 2, beyond = 5, worth_a_warning = 0.1;  // times the noise; of the spread
+  return of.one_by_one.n >= enough_rows && of.one_by_one.nrmse > between * of.nrmse_of_noise &&
+         error > std::max(beyond * of.nrmse_of_noise, worth_a_warning);
+}
+
+// What a model may have wrong that rows left out are predicted badly.
+std::string causes_text(const Prior& prior) {
+  std::vector<std::string> causes;
+  if (prior.system->layout().nu > 0) causes.emplace_back("an input that is clipped, late or scaled");
+  causes.emplace_back("a mass, an inertia or a length that is off");
+  causes.emplace_back("a constraint that is missing");
+  if (std::ranges::any_of(prior.latents, &Latent::is_potential))
+    causes.emplace_back("a force that dissipates, which a potential does not");
+  causes.emplace_back("a force that no latent stands for");
+  return fmt::format(
+      "Something acts otherwise than the model has it ({}), or the rows are too few, or of one motion, for what the "
+      "model leaves open",
+      fmt::join(causes, ", "));
+}
+
+// Rows or stretches of which half of what they do, or more, is not predicted.
+struct LittlePredicted {
+  const Evaluation::Part* part = nullptr;  // null: none
+  const char* what = "";
+};
+
+LittlePredicted little_predicted(const CrossValidation& of) {
+  if (of.predicts_little()) return {&*of.stretches, "stretches of the log that it has not seen"};
+  const bool rows = is_little_predicted(of.one_by_one, of.nrmse_of_noise) && std::isfinite(of.one_by_one.nrmse);
+  if (rows && !has_far_values(of)) return {&of.one_by_one, "rows left out one by one"};
+  return {};
+}
+
+}  // namespace
+
+void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes, const Prior& prior) {
+  const Evaluation::Part& rows = cross_validation.one_by_one;
+  const double noise = cross_validation.nrmse_of_noise;
+  if (const LittlePredicted little = little_predicted(cross_validation); little.part != nullptr) {
+    const bool is_worse_than_mean = little.part->nrmse >= 1;
+    const bool is_warning = is_worse_than_mean || denies_model(cross_validation, little.part->nrmse);
+    notes.push_back(fmt::format(
+        "{}of {} the fit says little{}: nrmse {:.2g}, of which the noise makes {:.2g}. {}", is_warning ? "warning: " : "",
+        little.what, is_worse_than_mean ? ", worse than their mean would" : "", little.part->nrmse, noise, causes_text(prior)));
+  } else if (predicts_stretches_worse(cross_validation)) {
+    const Evaluation::Part& stretches = *cross_validation.stretches;
+    notes.push_back(
+        fmt::format("{}stretches of the log that were left out are predicted worse than rows left out one by one: nrmse {:.2g}, "
+                    "not {:.2g}, of "
+                    "which the noise makes {:.2g}; the intervals of 95 % hold {:.0f} %. {}",
+                    denies_model(cross_validation, stretches.nrmse) ? "warning: " : "", stretches.nrmse, rows.nrmse, noise,
+                    100 * stretches.coverage95, causes_text(prior)));
+  } else if (predicts_rows_badly(cross_validation)) {
+    notes.push_back(fmt::format(
+        "rows left out one by one are predicted far worse than the noise: nrmse {:.2g}, of which the noise makes {:.2g}. {}",
+        rows.nrmse, noise, causes_text(prior)));
+  }
+}
+
+bool last_beyond_noise(const std::vector<TrainingResidual>& residuals) {
+  constexpr double beyond = 2;  // times the noise; errors that last are 1
+  return std::ranges::any_of(residuals,
+                             [](const TrainingResidual& one) { return one.is_correlated() && one.rms_in_noise > beyond; });
 }
 
 std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
   std::vector<std::string> correlated;
+  double in_noise = 0;
   for (const TrainingResidual& one : residuals) {
-    if (one.is_correlated()) correlated.push_back(fmt::format("{} ({:.2g})", one.output, one.serial_correlation));
+    if (!one.is_correlated()) continue;
+    correlated.push_back(fmt::format("{} ({:.2g})", one.output, one.serial_correlation));
+    in_noise = std::max(in_noise, one.rms_in_noise);
   }
   if (correlated.empty()) return {};
+  if (last_beyond_noise(residuals)) {
+    return fmt::format(
+        "residuals go on from row to row, correlation {}, and are {:.2g} times the noise: a mass, a length, a force or a "
+        "constraint of the model is wrong or missing",
+        fmt::join(correlated, ", "), in_noise);
+  }
   return fmt::format(
       "residuals go on from row to row, correlation {}: something that lasts longer than a sample is missing, and "
       "the rows are fewer measurements than they seem",

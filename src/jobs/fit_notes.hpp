@@ -19,12 +19,30 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
 // Which measured values lie so far from all others that a fit may fail for them; empty where none do, or many.
 std::string gross_errors_text(const FitProblem& problem);
 
-// What the residuals say against the data, the constraints or the noise.
-void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
-                        std::vector<std::string>& notes);
+// What a fit is judged by.
+struct JudgedData {
+  std::vector<Observations> observations;    // of the posterior, NaN where a robust fit distrusts a value
+  std::vector<std::vector<int>> lines = {};  // per Observations: the line in its log of each state; empty where it is not known
+};
 
-// Whether the fit says little of what it has not seen.
-void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes);
+// Whether measured accelerations do not obey the constraints.
+bool denies_constraints(const Posterior& posterior, const JudgedData& judged);
+
+// What the residuals say against the data, the constraints or the noise.
+void add_residual_notes(const Posterior& posterior, const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
+                        std::vector<std::string>& notes);
+inline void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
+                               std::vector<std::string>& notes) {
+  add_residual_notes(posterior, {posterior.observations()}, residuals, notes);
+}
+
+// Whether the fit says little of what it has not seen, or less than the noise lets it.
+// @param prior  of which the possible causes are named; null: not known
+void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes, const Prior& prior);
+
+// Whether residuals that go on from row to row are larger than the noise: then it is the model that is wrong, and not the noise that
+// lasts.
+bool last_beyond_noise(const std::vector<TrainingResidual>& residuals);
 
 // Which residuals go on from row to row; empty where none do.
 std::string correlated_text(const std::vector<TrainingResidual>& residuals);

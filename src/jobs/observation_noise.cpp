@@ -8,6 +8,7 @@
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "base/number_range.hpp"
 #include "gp2/error.hpp"
 #include "gp2/training/robust.hpp"
 
@@ -28,7 +29,7 @@ std::string rounded_up(double value) {
   return text;
 }
 
-// σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size
+// σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size, or σ is beyond what has a square
 struct NoiseRule {
   std::string source, name;  // where σ comes from; the row
   double signal = 0;         // its size
@@ -42,6 +43,11 @@ struct NoiseRule {
   /// @param stddev  ∞ where nothing is measured
   /// @param rows    of the log, of each value
   void require_each(const Eigen::RowVectorXd& stddev, const std::vector<int>& rows) const {
+    Index largest = 0;
+    const double most = stddev.array().isInf().select(0, stddev).maxCoeff(&largest);
+    if (most > largest_number) {
+      refuse_too_large(most, fmt::format("data row {}: ", rows[static_cast<std::size_t>(largest)] + 1));
+    }
     if (!((signal / stddev.array()).square().sum() > largest_norm)) return;
     Index worst = 0;
     const double least = stddev.minCoeff(&worst);
@@ -55,12 +61,19 @@ struct NoiseRule {
     if (!(stddev > 0) || !std::isfinite(stddev)) {
       throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev));
     }
+    if (stddev > largest_number) refuse_too_large(stddev);
     if (!estimated && stddev < smallest()) {
       throw InputError(
           fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
                       "of {:.3g}; the smallest usable value is {}",
                       source, stddev, name, signal, rounded_up(smallest())));
     }
+  }
+
+  /// @param place  "data row 3: ", or nothing
+  [[noreturn]] void refuse_too_large(double stddev, const std::string& place = "") const {
+    throw InputError(fmt::format("{}: {}the noise standard deviation {} of {} is too large: at most {:.0e} can be computed with",
+                                 source, place, stddev, name, largest_number));
   }
 };
 
@@ -162,6 +175,9 @@ VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Re
   for (Index k = 0; k < stddev.size(); ++k) {
     const auto row = static_cast<std::size_t>(readings.view.rows[static_cast<std::size_t>(k)]);
     const std::string& name = names[static_cast<std::size_t>(k)];
+    // a robust fit leaves out values that have no square
+    const bool has_squares = options.robust || !(readings.values.row(k).array().abs() > largest_number).any();
+    if (!has_squares) require_no_gross_errors(readings.values.row(k), name);
     if (readings.states_noise(k)) {
       stddev[k] = 1;
       continue;
@@ -207,7 +223,10 @@ MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::string>
 void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev,
                    const std::vector<int>& rows) {
   const NoiseRule rule{source, name, signal, static_cast<int>(stddev.size())};
-  if (rows.empty()) return rule.require(stddev.minCoeff(), /*estimated=*/false);
+  if (rows.empty()) {
+    if (const double least = stddev.minCoeff(); std::isfinite(least)) rule.require(least, /*estimated=*/false);
+    return;
+  }
   rule.require_each(stddev, rows);
 }
 

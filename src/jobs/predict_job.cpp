@@ -1,6 +1,7 @@
 #include "gp2/jobs/predict_job.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <utility>
 
@@ -10,6 +11,7 @@
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
+#include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "jobs/read_observations.hpp"
 
@@ -67,6 +69,28 @@ void predict_marginals(const Posterior& posterior, const View& view, const Matri
   });
   if (n_clipped > 0) out.notes.push_back(fmt::format("{} variances were negative by rounding and set to 0", n_clipped));
 }
+
+}  // namespace
+
+void require_memory_of_samples(const Posterior& posterior, const View& view, Index n_states, int n_samples,
+                               std::optional<double> free) {
+  constexpr double number = 8, name = 64, small = 1e8, share = 0.9;  // bytes; of what is free
+  const auto n = static_cast<double>(n_states);
+  double n_latent = 0;
+  for (const Latent& latent : posterior.prior().latents) n_latent += n * latent.size();
+  // the covariance of the latents and its factor; then, of each sample, latents twice and the view in four places
+  const double all = number * 2 * n_latent * n_latent;
+  const double one = number * (2 * n_latent + 4 * n * view.size()) + name * view.size();
+  const double bytes = all + n_samples * one;
+  if (!free || bytes <= std::max(share * *free, small)) return;
+  constexpr double gigabyte = 1e9;
+  const double most = std::floor((share * *free - all) / one);
+  throw InputError(fmt::format(
+      "`samples`: {} samples of {} rows together take {:.3g} GB of memory, of which {:.1f} GB are free; {}", n_samples, n_states,
+      bytes / gigabyte, *free / gigabyte, most >= 1 ? fmt::format("{:.0f} samples would fit", most) : "take fewer rows"));
+}
+
+namespace {
 
 // NAME_sample1 … of every name, then NAME_sample2 …: draws of the view at all states together.
 void add_samples(const Posterior& posterior, const View& view, const MatrixXd& states, int n_samples, std::uint64_t seed,
@@ -185,7 +209,9 @@ PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewR
   PredictedView out{system_of(fit, prior, request.system), {}, {}};
   out.view = View::all(request.quantity, *out.prior.system);
   out.view.other_system = out.other_system;
-  if (out.view.size() == 0) {
+  const View::Quantity& asked = request.quantity;
+  const bool is_of_constraints = asked == View::Quantity::multipliers || asked == View::Quantity::constraint_force;
+  if (is_of_constraints && out.prior.system->nc() == 0) {
     throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
   }
   set_time_step(out.view, request.time_step);
@@ -232,7 +258,8 @@ PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior,
   if (request.covariance == PredictRequest::Covariance::full) throw InputError("`potential` goes with `cov=none` or `cov=std`");
   const LatentRange range = latents_called(posterior.prior(), *request.potential, "`potential`");
   const PredictedView at = predicted_view(fit, posterior.prior(), view);
-  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, {}, at.actuators);
+  const LogStates log =
+      read_log_states(at.prior, at.view, *at.model, table, request.columns, {}, at.actuators, posterior.values().parameters);
   PredictOutcome out{{"potential@" + *request.potential}, {}, log.notes};
   if (log.states.cols() == 0) return out;
   const Posterior::Potential energy = posterior.potential(range.first, log.states, log.states.col(0));
@@ -251,7 +278,9 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
     throw InputError("`inverse_dynamics` stands in the place of a view: leave `view`, `latent`, `dt` and `samples` out");
   }
   const FitSystem at = system_of(fit, posterior.prior(), view.system);
-  WantedMotion wanted = read_wanted_motion(at.prior, *at.model, log, request.columns);
+  const Eigen::VectorXd& fitted = posterior.values().parameters;
+  WantedMotion wanted = read_wanted_motion(at.prior, *at.model, log, request.columns,
+                                           at.other_system ? at.other_system->parameters(fitted) : fitted);
   wanted.view.other_system = at.other_system;
   const InverseDynamics found =
       at_states_of(log.name(), [&] { return inverse_dynamics(posterior, wanted.view, wanted.states, wanted.accelerations); });
@@ -312,10 +341,14 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
   if (request.potential) return predict_potential(fit, posterior, states, request);
   if (request.inverse_dynamics) return predict_inputs(fit, posterior, states, request);
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
-  LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators);
+  LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators,
+                                  parameters_of(at.view, posterior.values().parameters));
   const std::string name = states.name();
   states = CsvTable();  // a long log in memory once
   PredictOutcome out{at.names, {}, std::move(log.notes)};
+  if (request.n_samples) {
+    require_memory_of_samples(posterior, at.view, log.states.cols(), *request.n_samples, free_memory());
+  }
   at_states_of(name, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
   if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
   if (request.unconditioned) return out;
@@ -339,7 +372,8 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
   const std::vector<std::string> outputs =
       request.outputs.empty() ? outputs_to_compare(posterior, *at.model, log, request.columns, out.notes) : request.outputs;
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "`outputs`");
-  const LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs, at.actuators);
+  const LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs, at.actuators,
+                                           parameters_of(at.view, posterior.values().parameters));
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
   log = CsvTable();

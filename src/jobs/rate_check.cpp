@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <iterator>
 #include <numbers>
 #include <optional>
@@ -260,6 +261,43 @@ std::optional<PileUp> pile_up(const Ref<const RowVectorXd>& values) {
   const auto [at_end, value] = n_most >= n_least ? std::pair(n_most, sorted.back()) : std::pair(n_least, sorted.front());
   if (value == 0 || at_end < fewest || static_cast<double>(at_end) < least * static_cast<double>(n)) return std::nullopt;
   return PileUp{value, static_cast<double>(at_end) / static_cast<double>(n)};
+}
+
+std::vector<Index> far_values(const Ref<const RowVectorXd>& values) {
+  constexpr double far = 30;
+  constexpr Index fewest = 20, one_in = 200;
+  const std::vector<double> measured = measured_entries(values, 0);
+  const Index n = std::ssize(measured);
+  if (n < fewest) return {};
+  const double middle = median(measured);
+  std::vector<std::pair<double, Index>> distances;  // the farthest first
+  for (Index i = 0; i < values.size(); ++i) {
+    if (!std::isnan(values[i])) distances.emplace_back(std::abs(values[i] - middle), i);
+  }
+  std::ranges::sort(distances, std::greater());
+  std::vector<Index> rows;
+  for (Index k = 0; k < std::max<Index>(1, n / one_in); ++k) {
+    const auto at = static_cast<std::size_t>(k);
+    rows.push_back(distances[at].second);
+    const double next = distances[at + 1].first;
+    if (next > 0 && distances[at].first > far * next) {
+      std::ranges::sort(rows);
+      return rows;
+    }
+  }
+  return {};
+}
+
+std::optional<std::string> far_values_text(const std::string& input, const std::vector<RowVectorXd>& logs) {
+  std::vector<std::string> far;
+  for (std::size_t log = 0; log < logs.size(); ++log) {
+    const std::string of_log = logs.size() > 1 ? fmt::format(" of log {}", log + 1) : "";
+    for (const Index row : far_values(logs[log]))
+      far.push_back(fmt::format("{:.4g} at row {}{}", logs[log][row], row + 1, of_log));
+  }
+  if (far.empty()) return std::nullopt;
+  return fmt::format("single values of the input {} lie far from all others: {}. Mend them, or leave these rows out", input,
+                     fmt::join(far, ", "));
 }
 
 bool is_wrapped_in_degrees(const std::vector<double>& angles) {

@@ -43,6 +43,13 @@ struct PileUp {
 /// switched, held or coarsely rounded.
 std::optional<PileUp> pile_up(const Eigen::Ref<const Eigen::RowVectorXd>& values);
 
+/// The few values, at most one in 200 and at least one, that lie thirty times as far from the median as any other; none where all
+/// others are the same, as those of an input between pulses are.
+std::vector<Eigen::Index> far_values(const Eigen::Ref<const Eigen::RowVectorXd>& values);
+
+/// Which of an input's values in some logs these are, if any.
+std::optional<std::string> far_values_text(const std::string& input, const std::vector<Eigen::RowVectorXd>& logs);
+
 /// Whether an angle in degrees is wrapped: from sample to sample it jumps by nearly 360, between -180 and 180 or 0 and 360, and
 /// moves little else.
 bool is_wrapped_in_degrees(const std::vector<double>& angles);

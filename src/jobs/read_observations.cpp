@@ -50,14 +50,31 @@ void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std:
   if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log.name(), fmt::join(unused, ", ")));
 }
 
+// Whether a constraint reads parameters that a fit is to estimate.
+bool reads_estimates(const System& system, const VectorXd& state, const VectorXd& parameters, const std::string& constraint,
+                     const FitProblemOptions& options) {
+  VectorXd others = parameters;
+  for (Index k = 0; k < others.size(); ++k) {
+    const Parameter& one = system.parameters()[static_cast<std::size_t>(k)];
+    const bool is_estimated = options.estimate ? std::ranges::count(*options.estimate, one.name) > 0 : one.estimate;
+    if (is_estimated) others[k] += 1e-3 * (1 + std::abs(others[k]));
+  }
+  const VectorXd change = system.residuals(state, others) - system.residuals(state, parameters);
+  for (std::size_t k = 0; k < system.residual_labels().size(); ++k) {
+    if (system.residual_labels()[k].text == constraint && change[static_cast<Index>(k)] != 0) return true;
+  }
+  return false;
+}
+
+// @param fit  the options of the fit that the log is read for: values of parameters that it estimates are not known yet; null: none
 void note_violation(const System& system, const MatrixXd& states, const VectorXd& parameters, const CsvTable& log,
-                    std::vector<std::string>& notes) {
+                    std::vector<std::string>& notes, const FitProblemOptions* fit = nullptr) {
   const auto violation = largest_violation(system, states, parameters);
-  if (!violation || violation->relative <= constraint_violation_tolerance) return;
+  if (!violation || violation->relative <= large_constraint_violation) return;
+  if (fit != nullptr && reads_estimates(system, states.col(violation->state), parameters, violation->constraint, *fit)) return;
   notes.push_back(
-      fmt::format("{}{}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
-                  violation->relative > large_constraint_violation ? "warning: " : "", log.name(), violation->constraint,
-                  violation->value, violation->state + 1, violation->relative));
+      fmt::format("warning: {}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
+                  log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
 }
 
 // The states, of the columns that a prior and a view need, and of those that only tell whether a state or a prediction is on the
@@ -522,7 +539,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
   note_reading(reader, log.table, notes);
   if (options.project) project(system, logged.parameters, log.table, state_stddevs, readings.states, notes);
-  note_violation(system, readings.states, logged.parameters, log.table, notes);
+  note_violation(system, readings.states, logged.parameters, log.table, notes, &options);
   note_repeats(readings, log.table, notes);
   note_rest(logged, readings, log.table, notes);
 
@@ -581,7 +598,7 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, table) : MatrixXd();
   note_reading(reader, table, notes);
   if (options.project) project(system, logged.parameters, table, state_stddevs, readings.states, notes);
-  note_violation(system, readings.states, logged.parameters, table, notes);
+  note_violation(system, readings.states, logged.parameters, table, notes, &options);
   std::vector<int> measured = measured_rows(readings, names, table, notes);
   keep_known(commanded, table, measured, notes);
   readings.keep(measured);
@@ -631,7 +648,8 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations,
-                          const std::optional<std::vector<Actuator>>& actuators, bool projects) {
+                          const std::optional<std::vector<Actuator>>& actuators, const std::optional<VectorXd>& given,
+                          bool projects) {
   LogReader reader = open_log(model, log, columns);
   LogStates out{states_of(prior, view, reader, projects), reader.measurements(accelerations), {}, {}};
   const std::vector<std::string> stated = stated_accelerations(accelerations, reader);
@@ -657,14 +675,14 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   }
   const MatrixXd state_stddevs = projects ? stated_state_deviations(*prior.system, reader, log) : MatrixXd();
   note_reading(reader, log, out.notes);
-  const VectorXd parameters = prior.system->parameter_values();
+  const VectorXd parameters = given.value_or(prior.system->parameter_values());
   if (projects) project(*prior.system, parameters, log, state_stddevs, out.states, out.notes);
   note_violation(*prior.system, out.states, parameters, log, out.notes);
   return out;
 }
 
 WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const CsvTable& log,
-                                const std::map<std::string, std::string>& columns) {
+                                const std::map<std::string, std::string>& columns, const VectorXd& parameters) {
   const System& system = *prior.system;
   const StateLayout layout = system.layout();
   LogReader reader = open_log(model, log, columns);
@@ -685,7 +703,7 @@ WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const Cs
   for (int k = 0; k < layout.nu; ++k) {
     if (!is_given[k]) out.states.row(layout.u(k)).setZero();
   }
-  note_violation(system, out.states, system.parameter_values(), log, out.notes);
+  note_violation(system, out.states, parameters, log, out.notes);
   return out;
 }
 

@@ -6,7 +6,6 @@
 #include <fmt/ranges.h>
 
 #include "gp2/jobs/report_job.hpp"
-#include "gp2/training/laplace.hpp"
 
 namespace gp2 {
 
@@ -16,10 +15,6 @@ using Level = Advice::Level;
 
 // a feature that moves the acceleration by less than this, in spreads, over its own spread hardly matters
 constexpr double irrelevant = 0.01;
-
-bool is_collapsed_noise(const Hyperparameter& h) {
-  return h.kind == Hyperparameter::Kind::noise_stddev && h.at_bound() && h.value < 2 * h.lower;
-}
 
 bool hardly_matters(const Relevance& one) { return std::max(one.relevance, one.effect.value_or(one.relevance)) < irrelevant; }
 
@@ -53,46 +48,45 @@ void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
   }
 }
 
-void bound_advice(const Report& report, std::vector<Advice>& advice) {
-  std::vector<std::string> collapsed, others;
-  for (const Hyperparameter& h : report.fit.report.hyperparameters) {
-    if (!h.at_bound()) continue;
-    const bool lower = h.value - h.lower < h.upper - h.value;
-    if (is_collapsed_noise(h)) {
-      collapsed.push_back(h.name);
-    } else if (h.kind == Hyperparameter::Kind::parameter) {
-      advice.push_back(
-          {Level::warning,
-           fmt::format("The parameter {} ended at its {} bound, {:.6g}.", h.name, lower ? "lower" : "upper", h.value),
-           fmt::format("If the true value may lie beyond, widen its bounds in the model file; if not, the data do "
-                       "not determine it or a part of the model is missing: fix it (`estimate` without {}) and "
-                       "look at the residuals.",
-                       h.name)});
-    } else if (h.kind == Hyperparameter::Kind::kernel && !lower && h.name.find("lengthscale") != std::string::npos) {
-      // the feature does not matter at all: said below
-    } else {
-      others.push_back(fmt::format("{} ({} bound, {:.4g})", h.name, lower ? "lower" : "upper", h.value));
+// Hyperparameters at a bound of which the fit itself says nothing: not the system's, and no noise at its lower bound.
+void bound_advice(const FitReport& report, std::vector<Advice>& advice) {
+  std::vector<std::string> short_lengthscales, others;
+  for (const Hyperparameter& h : report.hyperparameters) {
+    const bool is_lower = h.value - h.lower < h.upper - h.value;
+    const bool is_lengthscale = h.kind == Hyperparameter::Kind::kernel && h.name.find("lengthscale") != std::string::npos;
+    if (!h.at_bound() || h.is_system_parameter()) continue;
+    if (is_lengthscale && is_lower) {
+      short_lengthscales.push_back(fmt::format("{} ({:.4g})", h.name, h.value));
+    } else if (!(is_lengthscale || (h.kind == Hyperparameter::Kind::noise_stddev && is_lower))) {
+      // a long lengthscale is a feature that does not matter, of which relevance_advice speaks
+      others.push_back(fmt::format("{} ({} bound, {:.4g})", h.name, is_lower ? "lower" : "upper", h.value));
     }
   }
-  if (!collapsed.empty()) {
-    advice.push_back({Level::warning,
-                      fmt::format("The noise collapsed: {} ended at the lower bound.", fmt::join(collapsed, ", ")),
-                      "The fit takes the data as exact, and its bands are not to be trusted. The columns may follow from each "
-                      "other (gp2 check tells; fit with `observe`), or be smoothed or computed instead of measured; or give the "
-                      "noise you know with `noise_std`."});
+  if (!short_lengthscales.empty()) {
+    advice.push_back({Level::note, fmt::format("As short as is allowed: {}.", fmt::join(short_lengthscales, ", ")),
+                      "The latent changes from row to row there: it explains noise by wiggles, or takes up steps, single "
+                      "values that are wrong (`robust`), or what another feature would say. Look at the residuals against that "
+                      "feature; a smaller bound makes it worse."});
   }
   if (!others.empty()) {
     advice.push_back({Level::note, fmt::format("At a bound: {}.", fmt::join(others, ", ")),
-                      "Widen the bounds of the latent in the model file if you have no reason for them; a very short lengthscale "
-                      "means that the fit explains noise by wiggles."});
+                      "Widen the bounds in the model file if you have no reason for them."});
   }
 }
 
-void uncertainty_advice(const FitReport& report, std::vector<Advice>& advice) {
-  for (const UncertaintyNote& note : uncertainty_notes(report)) {
-    std::string text = note.text + ".";
-    text[0] = static_cast<char>(std::toupper(text[0]));
-    advice.push_back({note.is_warning ? Level::warning : Level::note, text, note.mend + "."});
+// The first sentence is what was found, and all others what to do.
+void note_advice(const std::vector<std::string>& notes, std::vector<Advice>& advice) {
+  constexpr std::string_view warning = "warning: ";
+  for (const std::string& note : notes) {
+    const bool is_warning = note.starts_with(warning);
+    std::string text = note.substr(is_warning ? warning.size() : 0);
+    if (!text.ends_with('.')) text += '.';
+    std::size_t end = text.find(". ");
+    while (end != std::string::npos && std::isupper(static_cast<unsigned char>(text[end + 2])) == 0)
+      end = text.find(". ", end + 1);
+    const bool is_one = end == std::string::npos;
+    advice.push_back(
+        {is_warning ? Level::warning : Level::note, is_one ? text : text.substr(0, end + 1), is_one ? "" : text.substr(end + 2)});
   }
 }
 
@@ -170,54 +164,17 @@ void independence_advice(const Report& report, std::vector<Advice>& advice) {
   }
 }
 
-// Residuals that the noise does not explain: of A ddq = b, and of each value from all others.
+// Measured accelerations of a test for which A ddq = b does not hold; of those of training the fit itself says it.
 void residual_advice(const Report& report, std::vector<Advice>& advice) {
   for (const ReportData& data : report.data) {
     for (const ConstraintResidual& one : data.constraint_residuals) {
-      if (!one.is_too_large()) continue;
+      if (!data.is_test || !one.is_too_large()) continue;
       advice.push_back(
           {Level::warning, fmt::format("The {} data deny a constraint: {}.", data.name, one.text()),
            "Until that is found nothing else on this page means much: look at the rows named, at units, signs and frames "
            "of the columns, and at the constants of the constraint."});
     }
   }
-  if (report.cross_validation.predicts_little()) {
-    advice.push_back(
-        {report.cross_validation.predicts_nothing() ? Level::warning : Level::note,
-         fmt::format("Of stretches of the training data that it has not seen the fit says little: nrmse {:.2g}, of which the "
-                     "noise makes {:.2g}.",
-                     report.cross_validation.stretches->nrmse, report.cross_validation.nrmse_of_noise),
-         "An input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves open. "
-         "Residuals against time, each feature and each input show which."});
-  }
-  for (const TrainingResidual& one : report.cross_validation.residuals) {
-    if (one.is_too_large()) {
-      advice.push_back(
-          {Level::warning,
-           fmt::format("Values of {} lie farther than noise from what all others predict: z rms {:.2g}, {:.0f} % within "
-                       "95 %.",
-                       one.output, one.rms, 100 * one.coverage95),
-           "The noise is stated too small, the column is wrong or lags the others, or a feature is missing. Residuals "
-           "against time and each feature show which."});
-    } else if (one.is_correlated()) {
-      advice.push_back(
-          {Level::note,
-           fmt::format("Residuals of {} go on from row to row: correlation {:.2g}.", one.output, one.serial_correlation),
-           "Something that lasts longer than a sample is missing, and the rows are fewer measurements than they seem: "
-           "deviations are too small. Take rows that are farther apart, or model what is missing."});
-    }
-  }
-}
-
-void robust_advice(const Report& report, std::vector<Advice>& advice) {
-  const std::vector<DistrustedValue>& distrusted = report.fit.report.distrusted;
-  if (distrusted.empty()) return;
-  const DistrustedValue& worst = distrusted.front();
-  advice.push_back(
-      {Level::note,
-       fmt::format("The robust fit distrusts {} {}; the farthest, at row {} of its data, by {:.3g} deviations.",
-                   distrusted.size(), distrusted.size() == 1 ? "value" : "values", worst.state + 1, worst.distance),
-       "They are among the points of the pictures. Where they have a cause, mend the log; the fit hardly heeds them."});
 }
 
 // A noise that came with each value is changed in the log, any other by an option.
@@ -336,13 +293,12 @@ void test_advice(const Report& report, const ReportData& data, std::vector<Advic
 std::vector<Advice> learning_advice(const Report& report) {
   std::vector<Advice> advice;
   optimiser_advice(report.fit.report, advice);
-  bound_advice(report, advice);
-  uncertainty_advice(report.fit.report, advice);
+  bound_advice(report.fit.report, advice);
+  note_advice(report.notes, advice);
   constraint_advice(report, advice);
   rank_advice(report, advice);
   independence_advice(report, advice);
   residual_advice(report, advice);
-  robust_advice(report, advice);
   for (const ReportData& data : report.data) {
     if (data.is_test) test_advice(report, data, advice);
   }

@@ -21,6 +21,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 #include "jobs/rollout.hpp"
 
@@ -437,7 +438,8 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   const std::vector<int> rows =
       acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, request.columns, notes), "`data`");
   const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
-  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, at.actuators);
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, at.actuators,
+                                        parameters_of(at.view, posterior.values().parameters));
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
   ReportData data = at_states_of(table.name(), [&] {
     MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
@@ -468,6 +470,22 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   return data;
 }
 
+namespace {
+
+// What the fit said when it ended; of a file that does not hold it, what its data tell without fitting again.
+std::vector<std::string> notes_of_fit(const FitFile& fit, const Posterior& posterior, const CrossValidation& cross_validation) {
+  if (fit.notes) return *fit.notes;
+  std::vector<std::string> notes = notes_of(fit.report, posterior);
+  if (fit.report.inducing) add_inducing_note(*fit.report.inducing, notes);
+  add_residual_notes(posterior, cross_validation.residuals, notes);
+  add_stretch_note(cross_validation, notes, posterior.prior());
+  const std::string correlated = correlated_text(cross_validation.residuals);
+  if (!correlated.empty()) notes.push_back(correlated);
+  return notes;
+}
+
+}  // namespace
+
 Report collect_report(FitFile fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes) {
   if (!request.data && !request.columns.empty()) {
     throw InputError("`map` names columns of `data`, which is not given; the fit has its own data");
@@ -479,6 +497,7 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   report.library = version();
   report.data = training_data(report.fit, posterior);
   report.cross_validation = cross_validate(report.fit, posterior);
+  report.notes = notes_of_fit(report.fit, posterior, report.cross_validation);
   report.relevance = relevance_of(posterior);
   report.learned = learned_forces(posterior);
   if (request.data) report.data.push_back(compare(report.fit, posterior, request, notes));

@@ -99,6 +99,7 @@ class Shooter {
     out.fit.report.hyperparameters = hyperparameters_;
     out.fit.report.draws.reset();
     out.fit.report.uncertainty.reset();
+    out.fit.notes.reset();
     out.fit.report.negative_log_likelihood = posterior_at(hyperparameters_).negative_log_likelihood();
     out.fit.report.termination = "parameters by multiple shooting";
     return out;

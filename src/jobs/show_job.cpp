@@ -39,11 +39,15 @@ std::string entry_text(Expression e, bool full) {
 }
 
 std::string matrix_text(const Rows& rows, bool full) {
-  // columns aligned
+  // columns are aligned, but for the sake of no long entry
+  constexpr std::size_t widest = 40;
   std::vector<std::size_t> widths;
   for (const auto& row : rows) {
     widths.resize(std::max(widths.size(), row.size()));
-    for (std::size_t j = 0; j < row.size(); ++j) widths[j] = std::max(widths[j], entry_text(row[j], full).size());
+    for (std::size_t j = 0; j < row.size(); ++j) {
+      const std::size_t size = entry_text(row[j], full).size();
+      if (size <= widest) widths[j] = std::max(widths[j], size);
+    }
   }
   std::string out;
   for (const auto& row : rows) {
@@ -279,13 +283,16 @@ std::string show(const Model& model, const ShowRequest& request) {
   return request.latex ? latex_text(Derived(system)) : whole_text(model, system, request.full);
 }
 
-std::string show(const FitFile& fit, const ShowRequest& request) {
+std::string show(const FitFile& fit, const ShowRequest& request, const Spelling& spelled) {
+  std::vector<std::string> notes = fit.notes.value_or(std::vector<std::string>());
+  for (std::string& note : notes) note = spelled(note);
   const std::string of_model = show(fit.model, request);
   if (request.latex) return of_model;
   const std::vector<std::int64_t> n = fit.n_states();
   const std::int64_t n_states = std::accumulate(n.begin(), n.end(), std::int64_t{0});
   if (!request.json) {
-    return fmt::format("learned from {} states of {}\n{}\n{}", n_states, fit.data_source, text_of(fit.report, fit.model),
+    const std::string said = notes.empty() ? "" : fmt::format("\nnotes\n  {}\n", fmt::join(notes, "\n  "));
+    return fmt::format("learned from {} states of {}\n{}{}\n{}", n_states, fit.data_source, text_of(fit.report, fit.model), said,
                        of_model);
   }
   OrderedJson json = OrderedJson::parse(of_model), hyperparameters = OrderedJson::object();
@@ -295,6 +302,7 @@ std::string show(const FitFile& fit, const ShowRequest& request) {
                  {"nll", fit.report.negative_log_likelihood},
                  {"termination", fit.report.termination},
                  {"hyperparameters", hyperparameters},
+                 {"notes", notes},
                  {"options", fit.options.empty() ? OrderedJson() : OrderedJson::parse(fit.options)}};
   return json.dump(2) + "\n";
 }
@@ -311,9 +319,13 @@ std::string unit_of(const Hyperparameter& h, const Model& model) {
 }
 
 std::string text_of(const FitReport& report, const Model& model) {
-  std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {})",
-                                 report.negative_log_likelihood, report.termination, report.iterations, report.restarts.size(),
-                                 report.best_restart + 1);
+  const double nll = report.negative_log_likelihood;
+  std::string text = "negative log likelihood ";
+  text += std::abs(nll) < 1e9 ? fmt::format("{:.6f}\n", nll) : fmt::format("{:.6g}\n", nll);
+  text += report.restarts.empty()
+              ? fmt::format("{}: a checkpoint of a fit under way", report.termination)
+              : fmt::format("{} after {} iterations ({} restart{}, best: {})", report.termination, report.iterations,
+                            report.restarts.size(), report.restarts.size() == 1 ? "" : "s", report.best_restart + 1);
   text += report.seconds > 0 ? fmt::format(", {:.2f} s\n", report.seconds) : "\n";  // no file holds how long it took
   if (report.draws) text += draws_text(report);
   for (const ActuatorEstimate& one : report.actuators) {

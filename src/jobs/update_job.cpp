@@ -10,6 +10,7 @@
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "base/number_range.hpp"
 #include "data/evenly.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/data/log_reader.hpp"
@@ -254,8 +255,9 @@ Posterior update_where_possible(Posterior&& posterior, FitReport& report, const 
 
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
                                std::vector<std::string>& notes) {
-  if (request.noise_stddev && !(*request.noise_stddev > 0 && std::isfinite(*request.noise_stddev))) {
-    throw InputError(fmt::format("`noise_std`: must be positive and finite, got {}", *request.noise_stddev));
+  if (request.noise_stddev && !(*request.noise_stddev > 0 && *request.noise_stddev <= largest_number)) {
+    throw InputError(
+        fmt::format("`noise_std`: must be positive and at most {:.0e}, got {}", largest_number, *request.noise_stddev));
   }
   const System& system = *posterior.prior().system;
   const std::vector<Observations>& groups = posterior.observations();
@@ -268,7 +270,8 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   view.rows = acceleration_rows(system, names, "`observe`");
   if (names.empty()) names = view.names(system);
   const bool projects = !fit.options.empty() && request_of(fit).problem.project;
-  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names, {}, projects);
+  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names, {},
+                                   posterior.values().parameters, projects);
 
   Noise noise = noise_of_more(fit, posterior, view, names, read, request, log, notes);
   notes.insert(notes.end(), read.notes.begin(), read.notes.end());
@@ -308,6 +311,7 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   const int n_more = more.n_data(), n_draws = posterior.n_components();
   Posterior all = update_where_possible(std::move(posterior), fit.report, more);
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
+  if (n_more > 0) fit.notes.reset();
   if (n_more > 0 && log.file()) fit.logs.push_back(*log.file());
   if (n_more > 0 && !fit.data_source.ends_with(log.name())) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
   const double of_more = left_out(all) - before;
@@ -325,7 +329,10 @@ void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& reques
   if (!request.window) return;
   if (*request.window < 1) throw InputError(fmt::format("`window`: must be positive, got {}", *request.window));
   const std::int64_t n_old = posterior.n_states() - *request.window;
-  if (n_old > 0) posterior = remove_oldest(std::move(posterior), static_cast<int>(n_old));
+  if (n_old > 0) {
+    posterior = remove_oldest(std::move(posterior), static_cast<int>(n_old));
+    fit.notes.reset();
+  }
   // logs of which nothing is left
   auto oldest = fit.logs.end();
   for (std::int64_t n_rows = 0; oldest != fit.logs.begin() && n_rows < *request.window;) n_rows += (--oldest)->rows;

@@ -9,6 +9,7 @@
 #include <fmt/ranges.h>
 
 #include "base/decompositions.hpp"
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
@@ -172,11 +173,12 @@ void check_contacts(const SymbolicSystem& system, const Ref<const MatrixXd>& sta
 
 }  // namespace
 
-std::optional<ConstraintViolation> largest_violation(const System& system, const Ref<const MatrixXd>& states,
-                                                     const Ref<const VectorXd>& parameters) {
+std::vector<ConstraintViolation> constraint_violations(const System& system, const Ref<const MatrixXd>& states,
+                                                       const Ref<const VectorXd>& parameters) {
   struct OfResidual {
     double largest = -1, squares = 0;
     Index at = 0;
+    Index n_active = 0;
     bool is_measured = true;
     VectorXd weights;  // largest |A|
   };
@@ -194,6 +196,7 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
         one.squares += size * size;
         if (size > one.largest) one.largest = size, one.at = first + i;
         const auto A = values.A(static_cast<int>(i)).row(labels[k].row);
+        one.n_active += system.is_conditional(labels[k].row) && A.isZero(0) ? 0 : 1;
         for (Index j = 0; j < A.size(); ++j) one.weights[j] = std::max(one.weights[j], std::abs(A[j]));
       }
     }
@@ -204,18 +207,28 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
     if (spreads[row] < 0) spreads[row] = spread(states.row(row));
     return spreads[row];
   };
-  std::optional<ConstraintViolation> worst;
+  std::vector<ConstraintViolation> violations;
   for (std::size_t k = 0; k < labels.size(); ++k) {
     const OfResidual& one = all[k];
+    ConstraintViolation& violation = violations.emplace_back();
+    violation = {not_a_number, not_a_number, not_a_number, 0, labels[k].text};
     if (!one.is_measured) continue;
     double scale = 0;
     for (int j = 0; j < system.nq(); ++j) {
       scale += one.weights[j] * spread_of(labels[k].velocity ? layout.dq(j) : layout.q(j));
     }
     if (scale == 0) scale = 1;
-    const double relative = one.largest / scale;
-    const double rms = std::sqrt(one.squares) / std::sqrt(static_cast<double>(states.cols())) / scale;
-    if (!worst || relative > worst->relative) worst = {relative, rms, one.largest, static_cast<int>(one.at), labels[k].text};
+    const double n = static_cast<double>(std::max<Index>(1, one.n_active));
+    violation = {one.largest / scale, std::sqrt(one.squares / n) / scale, one.largest, static_cast<int>(one.at), labels[k].text};
+  }
+  return violations;
+}
+
+std::optional<ConstraintViolation> largest_violation(const System& system, const Ref<const MatrixXd>& states,
+                                                     const Ref<const VectorXd>& parameters) {
+  std::optional<ConstraintViolation> worst;
+  for (ConstraintViolation& one : constraint_violations(system, states, parameters)) {
+    if (one.relative > (worst ? worst->relative : -1)) worst = std::move(one);
   }
   return worst;
 }

@@ -41,6 +41,10 @@ Model parse_model(std::string text, std::string name, const ModelCode& code, con
   if (model.text.size() > max_model_size) {
     throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", model.name, model.text.size(), max_model_size));
   }
+  const std::size_t first = model.text.find_first_not_of(" \t\r\n");
+  if (first != std::string::npos && model.text[first] == '{') {
+    throw InputError(fmt::format("{}: not valid TOML but JSON, as gp2 fit writes it: a model file is wanted here", model.name));
+  }
   try {
     const internal::StepLimit limit;
     require_safe(model.text, model.name);
@@ -135,13 +139,19 @@ Expression Model::expression(std::string_view written) const {
   return robot_expressions_ ? robot_expressions_->expand(value) : value;
 }
 
-std::string Model::unit_of(std::string_view quantity) const {
+namespace {
+
+std::string unit_among(const std::map<std::string, std::string>& units, std::string_view quantity) {
   const auto found = units.find(std::string(quantity.substr(0, quantity.find('@'))));
   return found == units.end() ? "" : found->second;
 }
 
+}  // namespace
+
+std::string Model::unit_of(std::string_view quantity) const { return unit_among(units, quantity); }
+
 std::string Model::labelled(const std::string& quantity) const {
-  const std::string unit = unit_of(quantity);
+  const std::string unit = unit_among(known_units(), quantity);
   return unit.empty() ? quantity : fmt::format("{} [{}]", quantity, unit);
 }
 

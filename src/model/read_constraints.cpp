@@ -98,14 +98,14 @@ void read_contact(const ModelReader& reader, Level level, const TomlValue& entry
   if (restitution) row.contact->restitution = read_restitution(reader, *restitution);
 }
 
-// "c", or { expr = "c", noise = 0.05, when = "gap <= 0" }, or { expr = "c", contact = "touch", restitution = 0.8 }
+// "c", or { expr = "c" } with noise = 0.05, when = "gap <= 0", or contact = "touch" and restitution = 0.8
 ConstraintRow read_constraint(const ModelReader& reader, Level level, const TomlValue& entry) {
   if (!entry.is_table()) return read_exact_constraint(reader, level, entry);
   entry.only_keys({"expr", "name", "noise", "when", "contact", "restitution"});
-  if (!entry.has("expr") || entry.n_entries() < 2) {
+  if (!entry.has("expr")) {
     entry.fail(
-        "expected { expr = \"dx*sin(heading) - dy*cos(heading)\", noise = 0.05 }, or when = \"gap <= 0\", or contact = "
-        "\"touch\" in the place of noise");
+        "missing expr; write { expr = \"dx*sin(heading) - dy*cos(heading)\", noise = 0.05 }, or name, when or contact in the "
+        "place of noise");
   }
   ConstraintRow row = read_exact_constraint(reader, level, entry.get("expr")->called(entry.key()));
   if (const auto noise = entry.get("noise")) {

@@ -48,7 +48,32 @@ void derive_units(const Coordinate& coordinate, std::map<std::string, std::strin
   for (const char* view : {"force_", "fc_"}) units[view + coordinate.name] = force;
 }
 
+// Of the joint of a robot; empty: it has none, as a quaternion, or is no joint's.
+std::string unit_of_joint(const RobotDescription& robot, const std::string& coordinate) {
+  for (const RobotDescription::Body& body : robot.bodies) {
+    for (const RobotDescription::Joint& joint : body.joints) {
+      const std::vector<std::string> names = joint.coordinates();
+      const auto place = std::find(names.begin(), names.end(), coordinate) - names.begin();
+      if (place == std::ssize(names)) continue;
+      constexpr std::ptrdiff_t n_positions = 3;
+      const bool is_free = joint.type == RobotDescription::Joint::Type::free;
+      if (joint.type == RobotDescription::Joint::Type::hinge) return "rad";
+      return joint.type == RobotDescription::Joint::Type::slide || (is_free && place < n_positions) ? "m" : "";
+    }
+  }
+  return "";
+}
+
 }  // namespace
+
+std::map<std::string, std::string> Model::known_units() const {
+  std::map<std::string, std::string> known = units;
+  for (const Coordinate& coordinate : system->coordinates()) {
+    std::string unit = coordinate.angle ? "rad" : robot ? unit_of_joint(*robot, coordinate.name) : "";
+    if (!unit.empty() && known.emplace(coordinate.name, std::move(unit)).second) derive_units(coordinate, known);
+  }
+  return known;
+}
 
 void read_units(ModelReader& reader, const TomlValue& table) {
   const SymbolicSystem::Definition& system = reader.definition;

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <map>
+#include <set>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -8,6 +9,7 @@
 #include "model/name_order.hpp"
 #include "model/table_readers.hpp"
 #include "model/tuned.hpp"
+#include "robots/robot_checks.hpp"
 
 // [parameters] and [let]
 
@@ -33,6 +35,45 @@ double read_robot_number(ModelReader& reader, const TomlValue& node, const std::
       "the robot has no number '{}'; there are mass(\"BODY\"), com(\"BODY\").x, inertia(\"BODY\").xx with the bodies {}, "
       "and damping(\"JOINT\"), stiffness, friction, armature with the joints {}",
       shortened(of), fmt::join(bodies, ", "), fmt::join(joints, ", ")));
+}
+
+bool may_be_negative(const std::string& robot_number) {
+  const bool is_product_of_inertia = robot_number.starts_with("inertia(") && robot_number.back() != *(robot_number.end() - 2);
+  return robot_number.starts_with("com(") || is_product_of_inertia;
+}
+
+void require_no_less_than_zero(const TomlValue& node, const std::string& of, const Parameter& parameter) {
+  if (may_be_negative(of)) return;
+  if (parameter.value < 0) node.fail(fmt::format("{} must be ≥ 0, got {}", of, parameter.value));
+  if (parameter.bounds && parameter.bounds->first < 0) {
+    node.fail(fmt::format("{} must be ≥ 0, and its bounds start at {}", of, parameter.bounds->first));
+  }
+}
+
+// A body whose moments are partly estimated needs no more than to start with an inertia: in the plane one moment acts alone.
+void require_possible_inertias(const ModelReader& reader, const TomlValue& parameters) {
+  std::map<std::string, double> values;
+  std::set<std::string> estimated;  // bodies
+  for (const auto& [of, name] : reader.robot_parameters) {
+    const auto parameter = std::ranges::find(reader.definition.parameters, name, &Parameter::name);
+    values[of] = parameter->value;
+    if (parameter->estimate) estimated.insert(of.substr(0, of.rfind('.')));
+  }
+  const RobotDescription robot = with_numbers(*reader.model.robot, values);
+  try {
+    check_robot(robot);
+  } catch (const InputError& error) {
+    parameters.fail(error.what());
+  }
+  for (std::size_t k = 0; k < robot.bodies.size(); ++k) {
+    const RobotDescription::Body& body = robot.bodies[k];
+    const bool is_own = body.inertia == reader.model.robot->bodies[k].inertia;
+    if (is_own || estimated.contains(fmt::format("inertia(\"{}\")", body.name)) || is_of_rigid_body(body.inertia)) continue;
+    parameters.fail(
+        fmt::format("body '{}': no rigid body has such an inertia, of which one principal moment is larger than the sum of the "
+                    "others",
+                    body.name));
+  }
 }
 
 // I2 = { value = "2*m", … }
@@ -78,8 +119,10 @@ void read_parameters(ModelReader& reader, const TomlValue& parameters) {
       node.fail("missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
     }
     require_within(parameter.value, entry.bounds, node);
+    if (of) require_no_less_than_zero(node, robot_number_name(of->text()), parameter);
     reader.definition.parameters.push_back(parameter);
   }
+  if (!reader.robot_parameters.empty()) require_possible_inertias(reader, parameters);
 }
 
 void read_derived_parameters(ModelReader& reader, const TomlValue& table) {

@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/number_range.hpp"
 #include "base/suggestion.hpp"
 
 namespace gp2 {
@@ -90,6 +91,9 @@ std::string TomlValue::text() const {
 double TomlValue::number() const {
   const std::optional<double> value = is_number() ? node_->value<double>() : std::nullopt;
   if (!value || !std::isfinite(*value)) fail(fmt::format("expected a finite number, got {}", written()));
+  if (std::abs(*value) > largest_number) {
+    fail(fmt::format("{} is too large: at most {:.0e} can be computed with", *value, largest_number));
+  }
   return *value;
 }
 

@@ -2,8 +2,10 @@
 
 #include <utility>
 
+#include <fmt/format.h>
 #include <Eigen/Core>
 
+#include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2 {
@@ -24,9 +26,16 @@ class AdmissibleDirections {
 
   /// @param A  (nc × nq)
   /// @returns E (nq × nq)
+  /// @throws NumericalError where W⁻¹ overflows or underflows.
   const Eigen::MatrixXd& compute(const Matrix& A) {
     if (b_.size() != A.rows()) b_.setZero(A.rows());
     projection_.compute(mass_, A, b_);
+    if (!projection_.motion_is_determined()) {
+      throw NumericalError(fmt::format(
+          "directions that the constraints leave: deviations from {:.3g} to {:.3g} have no squares to compute with in "
+          "double precision",
+          stddev_.minCoeff(), stddev_.maxCoeff()));
+    }
     E_ = projection_.T() * stddev_.asDiagonal();
     return E_;
   }

@@ -1,6 +1,7 @@
 #include "gp2/report/plot.hpp"
 
 #include <algorithm>
+#include <cctype>
 #include <cmath>
 #include <functional>
 
@@ -121,6 +122,13 @@ LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& reques
        [](const LearnedCurve& one) { return coordinate_of(one.force.names[static_cast<std::size_t>(one.row)]); });
   keep(curves, "`along`", request.along, [](const LearnedCurve& one) { return one.force.along; });
   return *std::ranges::max_element(curves, {}, [](const LearnedCurve& one) { return clearness(one.force, one.row); });
+}
+
+void require_name_of_svg(const std::filesystem::path& path) {
+  std::string ending = path.extension().string();
+  std::ranges::transform(ending, ending.begin(), [](unsigned char c) { return static_cast<char>(std::tolower(c)); });
+  if (ending.empty() || ending == ".svg") return;
+  throw InputError(fmt::format("{}: the picture is SVG: name a file that ends in .svg", path.string()));
 }
 
 std::string plot(const LearnedCurve& curve, const Model& model) {

@@ -91,7 +91,7 @@ Json model_json(const FitFile& fit) {
           {"file", fit.model.name},
           {"coordinates", coordinates},
           {"inputs", system.inputs()},
-          {"units", Json(fit.model.units)},
+          {"units", Json(fit.model.known_units())},
           {"constraints", constraints},
           {"A", A.empty() ? "" : matrix_mathml("A", A)},
           {"b", b.empty() ? "" : matrix_mathml("b", b)}};

@@ -87,10 +87,14 @@ void check_rotation(const Matrix3d& rotation, const std::string& where) {
   require(defect <= tolerance && rotation.determinant() > 0, where, "its rotation must have orthonormal, right-handed columns");
 }
 
+Vector3d principal_moments(const Matrix3d& inertia) {
+  return Eigen::SelfAdjointEigenSolver<Matrix3d>(inertia, Eigen::EigenvaluesOnly).eigenvalues();
+}
+
 void check_inertia(const Matrix3d& inertia, const std::string& where) {
   check_finite(inertia, where, "its inertia");
   require(inertia == inertia.transpose(), where, "its inertia must be symmetric");
-  const Vector3d moments = Eigen::SelfAdjointEigenSolver<Matrix3d>(inertia, Eigen::EigenvaluesOnly).eigenvalues();
+  const Vector3d moments = principal_moments(inertia);
   require(moments.minCoeff() >= -tolerance * moments.maxCoeff(), where,
           fmt::format("its inertia has the principal moment {}, but none can be negative", moments.minCoeff()));
 }
@@ -217,6 +221,11 @@ void check_robot(const RobotDescription& robot) {
     check_rotation(weld.rotation, where);
   }
   for (const Coupling& coupling : robot.couplings) loops.check_coupling(coupling);
+}
+
+bool is_of_rigid_body(const Matrix3d& inertia) {
+  const Vector3d moments = principal_moments(inertia);
+  return moments.maxCoeff() <= (1 + tolerance) * moments.sum() / 2;
 }
 
 // ---- to JSON

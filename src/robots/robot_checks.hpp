@@ -9,4 +9,7 @@ namespace gp2 {
 /// @throws InputError naming the first entry that breaks a rule.
 void check_robot(const RobotDescription& robot);
 
+/// Whether none of the principal moments is larger than the sum of the other two, as those of a rigid body are.
+bool is_of_rigid_body(const Eigen::Matrix3d& inertia);
+
 }  // namespace gp2

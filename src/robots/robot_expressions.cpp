@@ -23,26 +23,40 @@ std::string number_name(const char* kind, const std::string& of, const std::stri
   return fmt::format("{}(\"{}\"){}{}", kind, of, component.empty() ? "" : ".", component);
 }
 
+// Calls visit(name, number) for each number that a model may name; of inertias for the upper triangle.
+template <class Robot, class Visit>
+void for_each_number(Robot& robot, const Visit& visit) {
+  for (auto& body : robot.bodies) {
+    visit(number_name("mass", body.name), body.mass);
+    for (int i = 0; i < 3; ++i) visit(number_name("com", body.name, {axes[i]}), body.com[i]);
+    for (int i = 0; i < 3; ++i) {
+      for (int j = i; j < 3; ++j) visit(number_name("inertia", body.name, {axes[i], axes[j]}), body.inertia(i, j));
+    }
+  }
+  for (auto& body : robot.bodies) {
+    for (auto& joint : body.joints) {
+      visit(number_name("damping", joint.name), joint.damping);
+      if (!joint.has_quaternion()) visit(number_name("stiffness", joint.name), joint.stiffness);
+      visit(number_name("friction", joint.name), joint.dry_friction);
+      visit(number_name("armature", joint.name), joint.armature);
+    }
+  }
+}
+
 }  // namespace
 
 std::vector<std::pair<std::string, double>> robot_numbers(const RobotDescription& robot) {
   std::vector<std::pair<std::string, double>> numbers;
-  for (const RobotDescription::Body& body : robot.bodies) {
-    numbers.emplace_back(number_name("mass", body.name), body.mass);
-    for (int i = 0; i < 3; ++i) numbers.emplace_back(number_name("com", body.name, {axes[i]}), body.com[i]);
-    for (int i = 0; i < 3; ++i) {
-      for (int j = i; j < 3; ++j) {
-        numbers.emplace_back(number_name("inertia", body.name, {axes[i], axes[j]}), body.inertia(i, j));
-      }
-    }
-  }
-  for (const Joint* joint : robot.joints()) {
-    numbers.emplace_back(number_name("damping", joint->name), joint->damping);
-    if (!joint->has_quaternion()) numbers.emplace_back(number_name("stiffness", joint->name), joint->stiffness);
-    numbers.emplace_back(number_name("friction", joint->name), joint->dry_friction);
-    numbers.emplace_back(number_name("armature", joint->name), joint->armature);
-  }
+  for_each_number(robot, [&](std::string name, double value) { numbers.emplace_back(std::move(name), value); });
   return numbers;
+}
+
+RobotDescription with_numbers(RobotDescription robot, const std::map<std::string, double>& values) {
+  for_each_number(robot, [&](const std::string& name, double& number) {
+    if (const auto value = values.find(name); value != values.end()) number = value->second;
+  });
+  for (RobotDescription::Body& body : robot.bodies) body.inertia = body.inertia.selfadjointView<Eigen::Upper>();
+  return robot;
 }
 
 RobotExpressions::RobotExpressions(RobotDescription robot, ExpressionGraph& graph, const SystemSymbols& symbols,

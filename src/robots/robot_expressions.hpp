@@ -18,6 +18,8 @@ namespace gp2 {
 /// inertia("link7").xx (about the centre of mass, in the body's axes), damping("q1"), stiffness("q1"),
 /// friction("q1") (dry), armature("q1").
 std::vector<std::pair<std::string, double>> robot_numbers(const RobotDescription& robot);
+/// The robot with these values in the place of its own.
+RobotDescription with_numbers(RobotDescription robot, const std::map<std::string, double>& values);
 
 /// A point of a robot, or an axis of a frame on it, along one axis of the world, as a function of the coordinates q.
 ///

@@ -10,6 +10,7 @@
 #include <set>
 #include <sstream>
 #include <string_view>
+#include <vector>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -151,8 +152,17 @@ class Urdf {
     }
   }
 
-  // every link hangs, by way of its parents, on one that has none
+  // every link hangs, by way of its parents, on the one that has none
   void check_tree() const {
+    std::vector<std::string> roots;
+    std::copy_if(links_.begin(), links_.end(), std::back_inserter(roots),
+                 [&](const std::string& link) { return !parents_.contains(link); });
+    if (roots.size() > 1) {
+      fail(
+          fmt::format("no joint has the links {} as its child; a URDF has one root: join the others by a <joint>, with "
+                      "type=\"fixed\" where they do not move, or remove them",
+                      fmt::join(roots, ", ")));
+    }
     std::set<std::string> hangs;
     for (const std::string& link : links_) {
       std::set<std::string> path;

@@ -107,10 +107,10 @@ MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, co
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
     if (projection.mass_is_singular() && !truth.col(i).isZero(0)) {
-      throw InputError(internal::describe_fault(
-          *system_, states,
-          {i, "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force"},
-          first));
+      MechanicsBatch::Fault fault{i, {}};
+      fault.text =
+          "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force";
+      throw InputError(internal::describe_fault(*system_, states, fault, first));
     }
     accelerations.col(i) = projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i);
   }

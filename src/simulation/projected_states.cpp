@@ -43,6 +43,15 @@ VectorXd usual_deviations(const Ref<const MatrixXd>& states, const MatrixXd& std
   return ratios.empty() ? spreads : VectorXd(median(ratios) * spreads);
 }
 
+// The median size of a residual, which is exactly 0 where its row is switched off.
+double median_where_active(const System& system, int row, const Ref<const Eigen::RowVectorXd>& residuals) {
+  std::vector<double> sizes;
+  for (const double residual : residuals) {
+    if (!system.is_conditional(row) || residual != 0) sizes.push_back(std::abs(residual));
+  }
+  return sizes.empty() ? 0 : median(std::move(sizes));
+}
+
 }  // namespace
 
 ProjectedStates project_states(const System& system, const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& states,
@@ -98,21 +107,20 @@ SizeSummary summarise_sizes(const Ref<const VectorXd>& sizes) {
 
 std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd>& states,
                                   const Ref<const VectorXd>& parameters) {
-  const auto violation = largest_violation(system, states, parameters);
-  if (!violation || violation->relative <= constraint_violation_tolerance) return {};
+  const std::vector<ConstraintViolation> violations = constraint_violations(system, states, parameters);
+  if (std::ranges::none_of(violations, [](const auto& one) { return one.relative > constraint_violation_tolerance; })) return {};
   const MatrixXd residuals = system.residuals(states, parameters);
   if (residuals.hasNaN()) return {};
   using Level = Finding::Level;
-  const double largest = violation->relative > large_constraint_violation ? residuals.cwiseAbs().maxCoeff() : 0;
   std::vector<Finding> findings;
   for (Index k = 0; k < residuals.rows(); ++k) {
     const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
-    const SizeSummary size = summarise_sizes(residuals.row(k).cwiseAbs());
-    // beside the worst, what it drags along a little
-    const Level level = largest > 0 && size.largest > 1e-3 * largest ? Level::warning : Level::good;
+    const ConstraintViolation& violation = violations[static_cast<std::size_t>(k)];
     findings.push_back(
-        {level, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
-                            label.velocity ? "velocity" : "position", label.text, size.median, size.largest, size.at + 1)});
+        {violation.relative > large_constraint_violation ? Level::warning : Level::good,
+         fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
+                     label.velocity ? "velocity" : "position", label.text,
+                     median_where_active(system, label.row, residuals.row(k)), violation.value, violation.state + 1)});
   }
   const ProjectedStates projected = project_states(system, parameters, states);
   const std::vector<std::string> names = system.state_names();

@@ -124,10 +124,19 @@ void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& obs
     const double value = is_known ? std::clamp(found->value[place], h->lower, h->upper) : h->value;
     const double stddev =
         is_known ? std::max(found->stddev[place], 1e-6 * std::max(std::abs(value), h->upper - h->lower)) : h->upper - h->lower;
-    if (h->hyperprior.form != HyperPrior::Form::none && h->hyperprior.stddev < stddev) continue;
+    if (stddev_of(h->hyperprior) < stddev) continue;
     h->value = value;
     h->hyperprior = {HyperPrior::Form::normal, value, stddev};
   }
+}
+
+double stddev_of(const HyperPrior& prior) {
+  if (prior.form == HyperPrior::Form::none) return std::numeric_limits<double>::infinity();
+  return prior.stddev * (prior.form == HyperPrior::Form::normal ? 1 : prior.median);
+}
+
+bool is_known_by_bounds_only(const Hyperparameter& h) {
+  return h.is_system_parameter() && stddev_of(h.hyperprior) >= h.upper - h.lower;
 }
 
 namespace {

@@ -12,6 +12,7 @@
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "inference/requirements.hpp"
+#include "training/constraint_parameters.hpp"
 #include "training/curvature.hpp"
 
 namespace gp2 {
@@ -43,6 +44,23 @@ VectorXd variances_within(const VectorXd& boxes, const MatrixXd& flat) {
   const MatrixXd in_boxes = boxes.cwiseInverse().asDiagonal() * flat;
   const MatrixXd root = MatrixXd(in_boxes.transpose() * in_boxes).llt().matrixL().solve(MatrixXd(flat.transpose()));
   return root.colwise().squaredNorm();
+}
+
+// whether the data leave it no better known than its hyper-prior does
+bool is_silent(const Hyperparameter& h, double stddev) { return stddev >= 0.999 * stddev_of(h.hyperprior); }
+
+// Where the width of the bounds is all that gives a parameter its deviation, the data do not determine it.
+void forget_bounds(const std::vector<Hyperparameter>& hyperparameters, LaplaceUncertainty& out) {
+  for (Index k = 0; k < out.stddev.size(); ++k) {
+    const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
+    if (!is_known_by_bounds_only(h) || !std::isfinite(out.stddev[k]) || !is_silent(h, out.stddev[k])) continue;
+    out.stddev[k] = std::numeric_limits<double>::infinity();
+    out.correlation.row(k).setConstant(not_a_number);
+    out.correlation.col(k).setConstant(not_a_number);
+    out.correlation(k, k) = 1;
+    out.undetermined.conservativeResize(Eigen::NoChange, out.undetermined.cols() + 1);
+    out.undetermined.rightCols(1) = VectorXd::Unit(out.stddev.size(), k);
+  }
 }
 
 }  // namespace
@@ -84,6 +102,7 @@ LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::ve
     }
   }
   out.undetermined.colwise().normalize();
+  forget_bounds(hyperparameters, out);
   out.distance_from_optimum = curvature.distance_from_optimum();
   return out;
 }
@@ -160,6 +179,15 @@ void note_distance(double distance, std::vector<UncertaintyNote>& notes) {
                    "Fit with a larger `max_iterations`, or `start` from this fit"});
 }
 
+// The likelihood may have other optima, which a single start does not find, with other parameters and standard errors.
+void note_single_start(const FitReport& report, const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
+  const VectorXd& stddev = report.uncertainty->stddev;
+  const auto has_error = [&](int k) { return stddev[k] > 0 && std::isfinite(stddev[k]); };
+  if (report.restarts.size() != 1 || report.draws || std::none_of(parameters.begin(), parameters.end(), has_error)) return;
+  notes.push_back({false, "the standard errors are those about the optimum of a single start",
+                   "Other starts may lead to a better one: fit with more `restarts`"});
+}
+
 // Parameters that the data do not determine. Without hyper-priors combinations of other hyperparameters may be open too: of no
 // interest.
 void note_open_parameters(const std::vector<Hyperparameter>& fitted, const LaplaceUncertainty& uncertainty,
@@ -203,14 +231,11 @@ void note_silent_parameters(const std::vector<Hyperparameter>& fitted, const Lap
   std::vector<std::string> names;
   for (const int k : parameters) {
     const Hyperparameter& h = fitted[static_cast<std::size_t>(k)];
-    if (h.hyperprior.form != HyperPrior::Form::normal || uncertainty.stddev[k] < 0.999 * h.hyperprior.stddev) continue;
-    names.push_back(h.name);
+    if (std::isfinite(uncertainty.stddev[k]) && is_silent(h, uncertainty.stddev[k])) names.push_back(h.name);
   }
   if (names.empty()) return;
-  notes.push_back(
-      {false, fmt::format("the accelerations say nothing of {}", fmt::join(names, ", ")),
-       "The value is that of its prior, or what the constraints say of the logged states; where these are silent too, "
-       "the one it started from"});
+  notes.push_back({false, fmt::format("the accelerations say nothing of {}", fmt::join(names, ", ")),
+                   "The value is that of its prior, or what the constraints say of the logged states"});
 }
 
 // Pairs that the data hardly tell apart.
@@ -244,6 +269,7 @@ std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
   note_open_parameters(fitted, *report.uncertainty, parameters, notes);
   note_silent_parameters(fitted, *report.uncertainty, parameters, notes);
   note_pairs(fitted, *report.uncertainty, parameters, notes);
+  note_single_start(report, parameters, notes);
   return notes;
 }
 

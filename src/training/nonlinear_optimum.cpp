@@ -14,69 +14,101 @@
 
 namespace gp2 {
 
+namespace {
+
+// The linear prior about the posterior mean, found anew at each optimum of the hyperparameters.
+class LinearisationAtMean {
+ public:
+  LinearisationAtMean(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options,
+                      Approximation approximation, std::vector<Hyperparameter> start)
+      : prior_(prior),
+        observations_(observations),
+        options_(options),
+        workers_(Evaluators(options, approximation.points != nullptr).alone),
+        approximation_(std::move(approximation)),
+        last_(std::move(start)) {}
+
+  [[nodiscard]] const Approximation& approximation() const { return approximation_; }
+  [[nodiscard]] bool has_mean() const { return has_mean_; }
+  /// The last hyperparameters under which there was a mean; without one the start.
+  [[nodiscard]] const std::vector<Hyperparameter>& last() const { return last_; }
+
+  /// False where there is no mean, and the last linearisation stays.
+  bool move_to(const std::vector<Hyperparameter>& hyperparameters) {
+    ModelValues values = model_values(prior_, observations_, hyperparameters);
+    values.inducing = approximation_.points;
+    try {
+      approximation_.about = linearisation_of(prior_, observations_, values, workers_);
+    } catch (const NumericalError&) {
+      why_none_ = std::current_exception();
+      return false;
+    }
+    has_mean_ = true;
+    last_ = hyperparameters;
+    return true;
+  }
+
+  enum class Found { as_it_is, elsewhere, nowhere };
+  /// What is found about another mean may have none itself: then that of another restart is taken, else half of the way from the last
+  /// that had one, and again.
+  Found move_near(std::vector<Hyperparameter>& hyperparameters, const std::vector<std::vector<Hyperparameter>>& optima) {
+    constexpr int most_halvings = 6;
+    if (move_to(hyperparameters)) return Found::as_it_is;
+    for (std::size_t k = 1; k < optima.size() && !is_set(options_.stop); ++k) {
+      if (!move_to(optima[k])) continue;
+      hyperparameters = optima[k];
+      return Found::elsewhere;
+    }
+    for (int halvings = 0; halvings < most_halvings && !is_set(options_.stop); ++halvings) {
+      for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
+        Hyperparameter& h = hyperparameters[k];
+        h.value = std::clamp(h.value_at(0.5 * (h.coordinate() + last_[k].coordinate())), h.lower, h.upper);
+      }
+      if (move_to(hyperparameters)) return Found::elsewhere;
+    }
+    if (!has_mean_) std::rethrow_exception(why_none_);
+    hyperparameters = last_;
+    return Found::nowhere;
+  }
+
+ private:
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
+  const FitOptions& options_;
+  Workers workers_;
+  Approximation approximation_;
+  std::vector<Hyperparameter> last_;
+  bool has_mean_ = false;
+  std::exception_ptr why_none_;
+};
+
+}  // namespace
+
 FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>& observations,
                             std::vector<Hyperparameter> hyperparameters, const FitOptions& options, Approximation approximation) {
   constexpr int most = 20;
   constexpr double enough = 1e-3;  // nats
+  using Found = LinearisationAtMean::Found;
+  LinearisationAtMean linearisation(prior, observations, options, std::move(approximation), hyperparameters);
   FitOptions once = options;
   once.n_draws = 0;
   once.standard_errors = false;
-  const Workers workers = Evaluators(options, approximation.points != nullptr).alone;
-  // The linear prior about the posterior mean; false where there is none, and the last one stays.
-  bool has_mean = false;
-  std::exception_ptr why_none;
-  std::vector<Hyperparameter> last_with_mean = hyperparameters;
-  const auto linearise_at_mean = [&](const std::vector<Hyperparameter>& at) {
-    ModelValues values = model_values(prior, observations, at);
-    values.inducing = approximation.points;
-    try {
-      approximation.about = linearisation_of(prior, observations, values, workers);
-    } catch (const NumericalError&) {
-      why_none = std::current_exception();
-      return false;
-    }
-    has_mean = true;
-    last_with_mean = at;
-    return true;
-  };
-  // What is found about another mean may have none itself: then that of another restart, else half of the way from the best to the last
-  // that had one, and again.
-  enum class Found { as_it_is, elsewhere, nowhere };
-  const auto linearise = [&](std::vector<Hyperparameter>& at, const std::vector<std::vector<Hyperparameter>>& optima) {
-    constexpr int most_halvings = 6;
-    if (linearise_at_mean(at)) return Found::as_it_is;
-    for (std::size_t k = 1; k < optima.size() && !is_set(options.stop); ++k) {
-      if (!linearise_at_mean(optima[k])) continue;
-      at = optima[k];
-      return Found::elsewhere;
-    }
-    for (int halvings = 0; halvings < most_halvings && !is_set(options.stop); ++halvings) {
-      for (std::size_t k = 0; k < at.size(); ++k) {
-        const double middle = at[k].value_at(0.5 * (at[k].coordinate() + last_with_mean[k].coordinate()));
-        at[k].value = std::clamp(middle, at[k].lower, at[k].upper);
-      }
-      if (linearise_at_mean(at)) return Found::elsewhere;
-    }
-    if (!has_mean) std::rethrow_exception(why_none);
-    at = last_with_mean;
-    return Found::nowhere;
-  };
   std::optional<FitReport> first, last;
   double objective = std::numeric_limits<double>::infinity();
   bool stands = options.max_iterations == 0, is_stuck = false;
-  // Where no latent acts the load is that of known forces. Beside it what presses on a constraint and what rubs there are found both wrong, and
-  // each holds the other so. Without a mean at the start there is nothing better.
-  if (!approximation.about) linearise_at_mean(hyperparameters);
+  // Where no latent acts the load is that of known forces. Beside it what presses on a constraint and what rubs there are found both
+  // wrong, and each holds the other so. Without a mean at the start there is nothing better.
+  if (!linearisation.approximation().about) linearisation.move_to(hyperparameters);
   for (int round = 0; round < most && !stands && !is_stuck; ++round) {
     std::vector<std::vector<Hyperparameter>> optima;
-    FitReport report = trained(prior, observations, hyperparameters, once, approximation, &optima);
+    FitReport report = trained(prior, observations, hyperparameters, once, linearisation.approximation(), &optima);
     hyperparameters = report.hyperparameters;
     stands = std::abs(report.objective - objective) < enough;
     objective = report.objective;
     if (!first) first = report;
     last = std::move(report);
     if (is_set(options.stop)) break;
-    const Found found = linearise(hyperparameters, optima);
+    const Found found = linearisation.move_near(hyperparameters, optima);
     if (found != Found::as_it_is) {
       objective = std::numeric_limits<double>::infinity();
       stands = false;
@@ -87,13 +119,14 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   }
   once.n_draws = options.n_draws;
   once.standard_errors = options.standard_errors;
-  FitReport report =
-      last && is_set(options.stop) ? *std::move(last) : trained(prior, observations, hyperparameters, once, approximation);
+  FitReport report = last && is_set(options.stop)
+                         ? *std::move(last)
+                         : trained(prior, observations, hyperparameters, once, linearisation.approximation());
   if (!first) return report;
   // the last run may leave the hyperparameters that have a mean
-  if (has_mean && !is_set(options.stop) && !linearise_at_mean(report.hyperparameters)) {
-    report.hyperparameters = last_with_mean;
-    report.objective = report.negative_log_likelihood + negative_log_hyperpriors(last_with_mean, nullptr);
+  if (linearisation.has_mean() && !is_set(options.stop) && !linearisation.move_to(report.hyperparameters)) {
+    report.hyperparameters = linearisation.last();
+    report.objective = report.negative_log_likelihood + negative_log_hyperpriors(report.hyperparameters, nullptr);
     report.uncertainty.reset();
     stands = false;
   }

@@ -5,6 +5,8 @@
 #include "base/parallel.hpp"
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
+#include "gp2/training/default_hyperparameters.hpp"
+#include "inference/inducing_latents.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "training/optimum.hpp"
 
@@ -27,6 +29,12 @@ class TrainingThroughPoints {
     const int n_all = n_states(observations_);
     const int n_train = options_.n_train > 0 ? std::min(options_.n_train, n_all) : n_all;
     const bool optimises = options_.max_iterations > 0 && !hyperparameters.empty();
+    for (Hyperparameter& h : hyperparameters) {
+      const bool is_of_latent = h.kind == Hyperparameter::Kind::shared_signal_stddev;
+      if (is_of_latent && h.hyperprior.form != HyperPrior::Form::none &&
+          is_local(prior_.latents[static_cast<std::size_t>(h.owner)]))
+        h.hyperprior.stddev = Protocol::Standard::discrepancy_log_stddev_of_many;
+    }
     const int n_exact = states_of_exact(hyperparameters);
     const std::vector<Hyperparameter> first = hyperparameters;
     std::vector<int> stages;
@@ -37,7 +45,7 @@ class TrainingThroughPoints {
     std::optional<FitReport> report;
     for (std::size_t stage = 0; stage < stages.size() && !(report && is_set(options_.stop)); ++stage) {
       const bool is_last = stage + 1 == stages.size(), is_exact = stages[stage] <= n_exact && stages[stage] < n_all;
-      FitOptions options = of_stage(stage, n_stages);
+      FitOptions options = of_stage(stage, n_stages, stages[stage]);
       options.standard_errors = options.standard_errors && is_last;
       const std::vector<Observations> some =
           stages[stage] < n_all ? evenly(observations_, stages[stage]) : std::vector<Observations>();
@@ -68,7 +76,7 @@ class TrainingThroughPoints {
         is_set(options_.stop) ? left_out_as_some_tell(*report) : left_out(observations_, *report, all_workers());
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
     if (draws && !is_set(options_.stop))
-      report->draws = drawn(evenly(observations_, n_exact), report->hyperparameters, of_stage(stages.size(), n_stages));
+      report->draws = drawn(evenly(observations_, n_exact), report->hyperparameters, of_stage(stages.size(), n_stages, n_exact));
     if (is_set(options_.stop)) {
       report->termination = FitReport::interrupted;
       report->converged = false;
@@ -107,11 +115,12 @@ class TrainingThroughPoints {
   static constexpr int n_rounds = 3;
   static constexpr double enough = 0.5;  // nats, below which other points are not worth another run
 
-  [[nodiscard]] FitOptions of_stage(std::size_t stage, std::size_t n_stages) const {
+  [[nodiscard]] FitOptions of_stage(std::size_t stage, std::size_t n_stages, int n) const {
     FitOptions options = options_;
     options.n_draws = options.n_inducing = 0;
     if (!options_.progress) return options;
-    options.progress = [this, stage, n_stages](Progress progress) {
+    options.progress = [this, stage, n_stages, n](Progress progress) {
+      if (n_stages > 1) progress.n_states = n;
       progress.fraction = (static_cast<double>(stage) + progress.fraction) / static_cast<double>(n_stages);
       options_.progress(progress);
     };

@@ -1,6 +1,4 @@
 #include "gp2/training/robust.hpp"
-#include "base/not_a_number.hpp"
-#include "gp2/base/statistics.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -11,7 +9,11 @@
 
 #include <fmt/format.h>
 
+#include "base/not_a_number.hpp"
+#include "base/number_range.hpp"
 #include "base/parallel.hpp"
+#include "data/evenly.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "inference/requirements.hpp"
 
@@ -22,8 +24,6 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 namespace {
-
-constexpr double normal_median = 0.6744897501960817;  // of |z|, z ~ N(0, 1)
 
 // s of each value, 1 where it has no noise of its own
 MatrixXd scale_of(const Observations& group) {
@@ -45,9 +45,29 @@ struct Choice {
   }
 };
 
+// What all other values say of each, as leave_one_out. A posterior that keeps some of many states (KeptStates) says of each value with
+// it, y ~ N(m, v + σ²), what it says without: with h = v/σ², y − m and v are (1 − h) times what they are then.
+std::vector<LeaveOneOut> left_out_of(const std::vector<Observations>& fitted, const Posterior& posterior) {
+  if (posterior.n_states() == n_states(posterior.observations())) return leave_one_out(posterior);
+  constexpr double most = 0.99;  // of h, of which a discrepancy that counts as noise is no part
+  std::vector<LeaveOneOut> out;
+  for (std::size_t g = 0; g < fitted.size(); ++g) {
+    const Observations& group = fitted[g];
+    const Posterior::Marginal given = posterior.marginal(group.view(), group.states(), /*n_threads=*/0);
+    const MatrixXd variance = given.stddev().cwiseAbs2();
+    MatrixXd noise(variance.rows(), variance.cols());
+    for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = group.noise_at(posterior.values().noise_stddev[g], i);
+    const Eigen::ArrayXXd rest = 1 - (variance.array() / noise.array().square()).min(most);
+    out.push_back({group.values().array() - (group.values() - given.mean).array() / rest, variance.array() / rest});
+  }
+  return out;
+}
+
 // what to distrust in the light of a posterior under whatever noise
-Choice choose(const std::vector<Observations>& observations, const Posterior& posterior, double threshold) {
-  const std::vector<LeaveOneOut> left_out = leave_one_out(posterior);
+// @param fitted  the observations with the noise that the posterior was found with
+Choice choose(const std::vector<Observations>& observations, const std::vector<Observations>& fitted, const Posterior& posterior,
+              double threshold) {
+  const std::vector<LeaveOneOut> left_out = left_out_of(fitted, posterior);
   Choice choice{observations, {}};
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
@@ -61,7 +81,7 @@ Choice choose(const std::vector<Observations>& observations, const Posterior& po
     for (Index k = 0; k < noise.rows(); ++k) {
       std::vector<double> distances = measured_entries((residual.array() / stddev.array()).abs(), k);
       if (distances.empty()) continue;
-      const double usual = std::max(1.0, median(std::move(distances)) / normal_median);
+      const double usual = std::max(1.0, median(std::move(distances)) / median_of_normal);
       for (Index i = 0; i < noise.cols(); ++i) {
         const double distance = std::abs(residual(k, i)) / (usual * stddev(k, i));
         if (!(distance > threshold)) continue;
@@ -78,20 +98,43 @@ Choice choose(const std::vector<Observations>& observations, const Posterior& po
   return choice;
 }
 
-// the values without those that lie farther than `threshold` robust standard deviations from the median of their row
+// the values without those that lie farther than `threshold` robust standard deviations from the median of their row, and those
+// that have no square
 MatrixXd without_far_values(MatrixXd near, double threshold) {
+  near = (near.array().abs() > largest_number).select(not_a_number, near);
   for (Index k = 0; k < near.rows(); ++k) {
     std::vector<double> values = measured_entries(near, k);
     if (values.empty()) continue;
     const double middle = median(values);
     for (double& value : values) value = std::abs(value - middle);
-    const double spread = median(std::move(values)) / normal_median;
+    const double spread = median(std::move(values)) / median_of_normal;
     if (spread == 0) continue;  // most values are the same
     for (double& value : near.row(k)) {
       if (std::abs(value - middle) > threshold * spread) value = not_a_number;
     }
   }
   return near;
+}
+
+// Values that have no square are nothing but errors: they are distrusted and not measured.
+std::vector<DistrustedValue> leave_out_impossible(std::vector<Observations>& observations,
+                                                  const std::vector<VectorXd>& noise_stddev) {
+  std::vector<DistrustedValue> impossible;
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    MatrixXd values = observations[g].values();
+    const std::size_t n_before = impossible.size();
+    for (Index i = 0; i < values.cols(); ++i) {
+      for (Index k = 0; k < values.rows(); ++k) {
+        if (!(std::abs(values(k, i)) > largest_number)) continue;
+        const double distance = std::abs(values(k, i)) / observations[g].noise_at(noise_stddev[g], i)[k];
+        const double factor = std::min(distance, std::numeric_limits<double>::max());
+        impossible.push_back({static_cast<int>(g), static_cast<int>(k), static_cast<int>(i), factor, factor});
+        values(k, i) = not_a_number;
+      }
+    }
+    if (impossible.size() > n_before) observations[g] = observations[g].with_values(std::move(values));
+  }
+  return impossible;
 }
 
 // what to distrust at sight, under a noise to start with
@@ -133,12 +176,13 @@ class Search {
       Fit& fitted = *next_fit;
       start = fitted.report.hyperparameters;
       std::optional<Choice> next;
-      if (!stopped()) next = choose(observations_, fitted.posterior, robust_.threshold);
+      if (!stopped()) next = choose(observations_, choice.observations, fitted.posterior, robust_.threshold);
       fitted.report.distrusted = choice.distrusted;
       const double cost = fitted.report.objective + price() * static_cast<double>(choice.distrusted.size());
       if (cost < lowest_cost_) {
         lowest_cost_ = cost;
         best_ = std::move(fitted);
+        best_choice_ = choice;
       }
       if (!next || next->values() == choice.values()) break;
       choice = std::move(*next);
@@ -149,6 +193,8 @@ class Search {
   }
 
   [[nodiscard]] const Fit& best() const { return *best_; }
+  /// That it was fitted to.
+  [[nodiscard]] const Choice& best_choice() const { return best_choice_; }
   void forget_cost() { lowest_cost_ = std::numeric_limits<double>::infinity(); }
 
  private:
@@ -174,6 +220,7 @@ class Search {
   const FitOptions& options_;
   const RobustOptions& robust_;
   std::optional<Fit> best_;
+  Choice best_choice_;
   double lowest_cost_ = std::numeric_limits<double>::infinity();
 };
 
@@ -203,22 +250,24 @@ Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations
   // Outliers hide behind each other where a fit explains them all, by a signal that is large and short. From a choice that is
   // too strict at first it is not drawn there; the objective, at a price for each value distrusted, decides between them.
   const std::vector<VectorXd> noise = model_values(prior, observations, hyperparameters).noise_stddev;
+  std::vector<Observations> possible = observations;
+  const std::vector<DistrustedValue> impossible = leave_out_impossible(possible, noise);
   FitOptions full = options;
   full.n_draws = quick.n_draws = 0;  // drawn once, at the end
-  Search search(prior, observations, full, robust);
+  Search search(prior, possible, full, robust);
   for (const double threshold : {gross, suspicious}) {
-    search.run(choose_at_sight(observations, noise, threshold), hyperparameters, quick);
+    search.run(choose_at_sight(possible, noise, threshold), hyperparameters, quick);
   }
-  Choice choice{search.best().posterior.observations(), search.best().report.distrusted};
   search.forget_cost();
-  search.run(std::move(choice), hyperparameters, full);
+  search.run(search.best_choice(), hyperparameters, full);
   Fit out = search.best();
+  out.report.distrusted.insert(out.report.distrusted.begin(), impossible.begin(), impossible.end());
   if (options.n_draws == 0 || is_set(options.stop)) return out;
   FitOptions about_best = quick;
   about_best.n_draws = options.n_draws;
   about_best.standard_errors = false;
   try {
-    out.report.draws = fit(prior, out.posterior.observations(), out.report.hyperparameters, about_best).report.draws;
+    out.report.draws = fit(prior, search.best_choice().observations, out.report.hyperparameters, about_best).report.draws;
   } catch (const NumericalError&) {
     if (!is_set(options.stop)) throw;
   }
@@ -226,7 +275,7 @@ Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations
     out.report.converged = false;
     out.report.termination = FitReport::interrupted;
   }
-  if (out.report.draws) out.posterior = posterior_of(prior, out.posterior.observations(), out.report);
+  if (out.report.draws) out.posterior = posterior_of(prior, search.best_choice().observations, out.report);
   return out;
 }
 

@@ -1,3 +1,6 @@
+#include <cmath>
+
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -62,6 +65,52 @@ TEST(Check, WarnsOfStatesOffTheConstraint) {
     EXPECT_THAT(desk.done(line).err,
                 testing::ContainsRegex("warning: log.csv: states are off the constraint: .* -?0.1 at data row 4"));
   }
+}
+
+TEST(Check, TakesNoMapWithoutALog) {
+  const Outcome checked = Desk().run("gp2 check models/surface.toml --map q1=x");
+  EXPECT_NE(checked.status, 0);
+  EXPECT_THAT(checked.err, HasSubstr("--map renames columns of a log, and there is none: give --data"));
+}
+
+TEST(Check, JudgesPriorsByTheirBounds) {
+  const Desk desk;
+  const auto check_of = [&](const std::string& bounds, const std::string& prior) {
+    desk.write("model.toml", "coordinates = [\"x\"]\n[parameters]\nm = { value = 1, bounds = " + bounds +
+                                 ", estimate = true, prior = " + prior +
+                                 " }\n[mechanics]\nmass = [[\"m\"]]\n[[latent]]\nfeatures = [\"dx\"]\n");
+    return desk.run("gp2 check model.toml");
+  };
+  const Outcome refused = check_of("[0, 2]", "{ median = 0.5, log_stddev = 0.1 }");
+  EXPECT_NE(refused.status, 0);
+  EXPECT_THAT(refused.out,
+              testing::ContainsRegex("ERROR +parameter 'm': a prior of the logarithm needs bounds above 0, got .0, 2"));
+  const Outcome beyond = check_of("[0, 2]", "{ mean = 5, stddev = 0.1 }");
+  EXPECT_THAT(beyond.out,
+              testing::ContainsRegex("warning +parameter 'm': the middle of its prior, 5, lies 30 of its deviations"));
+  EXPECT_THAT(check_of("[0.1, 2]", "{ median = 0.5, log_stddev = 0.1 }").out, Not(HasSubstr("prior")));
+  EXPECT_THAT(check_of("[0, 2]", "{ mean = 2.1, stddev = 0.1 }").out, Not(HasSubstr("prior")));
+}
+
+// an angle that swings by half a radian, in rad and in degrees; a wheel that turns one way as fast as it likes
+TEST(Check, WarnsOfAnAngleThatSwingsByHalfTurnsFromRowToRow) {
+  const Desk desk;
+  desk.write("model.toml",
+             "coordinates = [{ name = \"a\", angle = true }]\n[mechanics]\nmass = [[\"1\"]]\n[[latent]]\nfeatures = [\"a\"]\n");
+  const auto check_of = [&](double scale, double spin) {
+    std::string log = "t,a,da,dda\n";
+    for (int k = 0; k < 100; ++k) {
+      const double t = 0.05 * k;
+      log += fmt::format("{},{},{},{}\n", t, scale * 0.5 * std::sin(4 * t) + spin * t, scale * 2 * std::cos(4 * t) + spin,
+                         -scale * 8 * std::sin(4 * t));
+    }
+    desk.write("log.csv", log);
+    return desk.run("gp2 check model.toml --data log.csv").out;
+  };
+  EXPECT_THAT(check_of(57.3, 0),
+              testing::ContainsRegex("warning +a moves by more than half a turn from row to row, forth and back"));
+  EXPECT_THAT(check_of(1, 0), Not(HasSubstr("half a turn")));
+  EXPECT_THAT(check_of(1, 100), Not(HasSubstr("half a turn")));
 }
 
 TEST(Check, SaysWhichAccelerationsTheLogLacks) {

@@ -208,7 +208,7 @@ TEST_F(FitCommand, MaxPointsTakesTheFirstRowsOfAShuffleBySeed) {
 
 TEST_F(FitCommand, MaxPointsBeyondTheLogTakesItAllInOrder) {
   fit("--max-iterations 0", "all.json");
-  fit("--max-points 30 --max-iterations 0");
+  fit("--max-points 31 --max-iterations 0");
   EXPECT_EQ(what_was_fitted("fit.json"), what_was_fitted("all.json"));
 }
 

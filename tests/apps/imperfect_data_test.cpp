@@ -7,7 +7,9 @@
 namespace gp2::test {
 namespace {
 
+using testing::AllOf;
 using testing::HasSubstr;
+using testing::Not;
 
 // the log of `desk` with one cell written anew, row from 0
 void spoil(const Desk& desk, const std::string& file, int row, const std::string& column, const std::string& text) {
@@ -35,6 +37,38 @@ TEST(ImperfectData, EveryCommandCopesWithEmptyCells) {
   desk.done("gp2 report fit.json --data log.csv -o report.html");
   desk.done("gp2 resample log.csv --model models/surface.toml -n 30 -o all.csv");
   desk.done("gp2 fit models/surface.toml --data all.csv --max-iterations 0 -o again.json");
+}
+
+TEST(ImperfectData, EvaluateSaysWhichFiguresAreNotDefinedAndWhichMeanNothing) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 30 -o log.csv");
+  desk.done("gp2 fit models/surface.toml --data log.csv --max-iterations 0 -o fit.json");
+  const std::string log = desk.read("log.csv");
+  desk.write("row.csv", log.substr(0, log.find('\n', log.find('\n') + 1) + 1));
+  const std::string one_row = desk.done("gp2 evaluate fit.json --data row.csv").out;
+  EXPECT_THAT(one_row, HasSubstr("nrmse                       not defined"));
+  EXPECT_THAT(one_row, AllOf(Not(HasSubstr("nan")), Not(HasSubstr("inf "))));
+  EXPECT_THAT(one_row, HasSubstr("(right only for targets without noise)"));
+  desk.write("wrong.toml", replaced(desk.read("models/surface.toml"), "u3 - m*g", "u3 + 9*m*g"));
+  desk.done("gp2 fit wrong.toml --data log.csv --max-iterations 0 --mean force --max-points 2 -o wrong.json");
+  desk.done("gp2 generate models/surface.toml --n 30 --seed 9 -o test.csv");
+  EXPECT_THAT(desk.done("gp2 evaluate wrong.json --data test.csv").out, HasSubstr("; above 1 their mean predicts better)"));
+}
+
+TEST(ImperfectData, StatesAreOnTheConstraintOrOffItByTheFittedParameters) {
+  const Desk desk;
+  const std::string surface = desk.read("models/surface.toml");
+  desk.write("start.toml",
+             replaced(surface, "p1 = { value = 0.08, bounds = [0.04, 0.16] }", "p1 = { value = 0.1, bounds = [0.04, 0.16] }"));
+  desk.done("gp2 generate models/surface.toml --n 30 --noise-std 0.01 -o log.csv");
+  desk.done("gp2 generate models/surface.toml --n 30 --seed 9 -o test.csv");
+  const std::string fit = "gp2 fit start.toml --data log.csv --mean force --restarts 1 --hyperparameters optimise -o fit.json";
+  desk.done(fit + " --estimate p1");
+  EXPECT_THAT(desk.done("gp2 evaluate fit.json --data test.csv").err, Not(HasSubstr("warning: test.csv: states are off")));
+  EXPECT_THAT(desk.done("gp2 predict fit.json --states test.csv -o out.csv").err,
+              Not(HasSubstr("warning: test.csv: states are off")));
+  desk.done(fit + " --max-iterations 0");
+  EXPECT_THAT(desk.done("gp2 evaluate fit.json --data test.csv").err, HasSubstr("warning: test.csv: states are off"));
 }
 
 TEST(ImperfectData, ARobustFitNamesTheLinesItDistrusts) {

@@ -176,5 +176,30 @@ TEST_P(SimdLoops, ContractionsAreWhatTheirFormulasSay) {
   }
 }
 
+TEST_P(SimdLoops, ATriangleIsSolvedForAnyNumberOfRowsAndColumns) {
+  RandomStream random(seed);
+  for (const Index n : {1, 2, 7, 8, 33, 64}) {
+    for (const Index m : {1, 3, 8, 31, 32, 75}) {
+      for (const bool reversed : {false, true}) {
+        SCOPED_TRACE(fmt::format("{} rows, {} columns", n, m));
+        Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> L(n, n);
+        MatrixXd B(n + 2, m);  // the last two rows are not of it
+        for (double& one : L.reshaped()) one = random.normal() / static_cast<double>(n);
+        for (double& one : B.reshaped()) one = random.normal();
+        L.diagonal().array() += 2;
+        const MatrixXd before = B, T = L.triangularView<Eigen::Lower>();
+        const MatrixXd right = reversed ? MatrixXd(before.topRows(n).colwise().reverse()) : MatrixXd(before.topRows(n));
+        L.diagonal() = L.diagonal().cwiseInverse().eval();
+        target().loops.solve_triangle(n, L.data(), reversed, m, B.data(), B.rows());
+        const MatrixXd X = reversed ? MatrixXd(B.topRows(n).colwise().reverse()) : MatrixXd(B.topRows(n));
+        // backward error of a substitution, and of the reciprocals
+        const MatrixXd bound = static_cast<double>(n + 4) * test::eps * (T.cwiseAbs() * X.cwiseAbs());
+        EXPECT_TRUE(((T * X - right).array().abs() <= bound.array() + 1e-300).all());
+        EXPECT_EQ(B.bottomRows(2), before.bottomRows(2));
+      }
+    }
+  }
+}
+
 }  // namespace
 }  // namespace gp2

@@ -95,6 +95,11 @@ TEST(Csv, ARaggedRowIsRefusedWithItsLineInTheFile) {
   EXPECT_EQ(input_error_of([] { parse("q1,q2\n1,2\n\n3\n"); }), "log.csv:4: ragged row: 1 cells, but the header has 2 columns");
   EXPECT_EQ(input_error_of([] { parse("q1,q2\n1,2,3\n"); }), "log.csv:2: ragged row: 3 cells, but the header has 2 columns");
   EXPECT_EQ(input_error_of([] { parse("q1,q2\n1,2,\n"); }), "log.csv:2: ragged row: 3 cells, but the header has 2 columns");
+  EXPECT_EQ(input_error_of([] { parse("# of Monday\nq1,q2\n1,2\n"); }),
+            "log.csv:2: ragged row: 2 cells, but the header has 1 columns: a line that begins with # is not read as a comment; "
+            "remove it");
+  EXPECT_THAT(input_error_of([] { parse("q1,q2\n# paused\n1,2\n"); }),
+              testing::AllOf(StartsWith("log.csv:2: ragged row: 1 cells"), EndsWith("is not read as a comment; remove it")));
 }
 
 TEST(Csv, AHeaderWithoutNamesOrWithOneNameTwiceIsRefused) {

@@ -52,6 +52,13 @@ class LogReaderTest : public testing::Test {
   const Model model = model_of("[\"q1\", \"q2\"]");
 };
 
+TEST_F(LogReaderTest, RefusesNumbersThatNothingCanBeComputedWith) {
+  EXPECT_EQ(state("q1\n1e100\n", "q1"), 1e100);
+  EXPECT_EQ(input_error_of([&] { state("q1\n-1e300\n", "q1"); }),
+            "log.csv:2: column 'q1': -1e+300 is too large: at most 1e+100 can be computed with");
+  EXPECT_THAT(input_error_of([&] { value("u1\n2e120\n", "u1"); }), HasSubstr("is too large"));
+}
+
 TEST_F(LogReaderTest, ReadsNoColumnAsTwoNames) {
   const CsvTable table = CsvTable::parse("q1,dq1,ddq1\n1,2,3\n", "log.csv");
   LogReader reader(table, *model.system, {{"q2", "q1"}});

@@ -16,6 +16,7 @@ using testing::AllOf;
 using testing::Contains;
 using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::Not;
 using testing::StartsWith;
 
 Model constrained_cart(const std::string& constraints) {
@@ -147,17 +148,58 @@ TEST(FitNotes, AParameterThatFollowsFromOthersIsNotEstimated) {
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, log, options); }), "`estimate`: 'm' stands twice");
 }
 
-std::vector<std::string> note_of_stretches(double one_by_one, double stretches, double coverage95, int n = 200) {
+// what check finds well is not worth a word, and of parameters that are estimated the fit itself finds the value
+TEST(FitNotes, TellOfStatesOffAConstraintThatIsKnown) {
+  const auto notes_of_log = [](const std::string& parameter, const std::string& y,
+                               const std::vector<std::string>& estimate = {}) {
+    const Model model = Model::parse("coordinates = ['x', 'y']\n[parameters]\nh = " + parameter +
+                                         "\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\n[constraints]\nposition = ['y - h*x']\n"
+                                         "[[latent]]\nkernel = 'se'\nfeatures = ['dx']\ndirections = 'acceleration'\n",
+                                     "ramp");
+    FitProblemOptions options;
+    options.noise_stddev = 0.1;
+    if (!estimate.empty()) options.estimate = estimate;
+    return make_fit_problem(model, CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0.5,2,1,0,0\n3," + y + ",6,3,1,0.5\n", "log.csv"),
+                            options)
+        .notes;
+  };
+  const auto told = Contains(StartsWith("warning: log.csv: states are off the constraint: 'y - h*x' is 0.1 at data row 2"));
+  const auto silent = testing::Not(Contains(HasSubstr("off the constraint")));
+  EXPECT_THAT(notes_of_log("0.5", "1.6"), told);
+  EXPECT_THAT(notes_of_log("0.5", "1.505"), silent);
+  EXPECT_THAT(notes_of_log("{ value = 0.5, bounds = [0, 2], estimate = true }", "1.6"), silent);
+  EXPECT_THAT(notes_of_log("0.5", "1.6", {"h"}), silent);
+}
+
+CrossValidation scores_of(double noise, double one_by_one, double stretches, double coverage95, int n) {
   CrossValidation scores;
-  scores.nrmse_of_noise = 0.01;
+  scores.nrmse_of_noise = noise;
   scores.one_by_one.nrmse = one_by_one;
-  scores.stretches.emplace();
+  scores.one_by_one.n = n;
+  scores.one_by_one.coverage95 = 0.95;
+  scores.stretches = scores.one_by_one;
   scores.stretches->nrmse = stretches;
   scores.stretches->coverage95 = coverage95;
-  scores.stretches->n = n;
+  return scores;
+}
+
+Prior prior_of_cart(const std::string& inputs, const std::string& directions) {
+  const Model model = Model::parse("coordinates = ['x', 'y']\n" + inputs +
+                                       "[mechanics]\nmass = [['2', '0'], ['0', '1']]\n[[latent]]\nfeatures = ['x', 'y']\n"
+                                       "directions = '" +
+                                       directions + "'\n",
+                                   "cart");
+  return make_prior(model);
+}
+
+std::vector<std::string> note_of(const CrossValidation& scores, const Prior& prior = prior_of_cart("inputs = ['u']\n", "force")) {
   std::vector<std::string> notes;
-  add_stretch_note(scores, notes);
+  add_stretch_note(scores, notes, prior);
   return notes;
+}
+
+std::vector<std::string> note_of_stretches(double one_by_one, double stretches, double coverage95, int n = 200) {
+  return note_of(scores_of(0.01, one_by_one, stretches, coverage95, n));
 }
 
 TEST(FitNotes, TellWhereStretchesArePredictedWorseThanRows) {
@@ -167,6 +209,89 @@ TEST(FitNotes, TellWhereStretchesArePredictedWorseThanRows) {
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8, 50), testing::IsEmpty()) << "too few rows for a coverage";
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.95), testing::IsEmpty());
   EXPECT_THAT(note_of_stretches(0.08, 0.085, 0.95), testing::IsEmpty()) << "rows are no better";
+}
+
+// figures of simulated mechanisms with and without a fault
+TEST(FitNotes, WarnWhereLeftOutRowsDenyTheModel) {
+  const auto warned = ElementsAre(StartsWith("warning: stretches of the log that were left out are predicted worse"));
+  EXPECT_THAT(note_of(scores_of(0.0147, 0.034, 0.196, 0.923, 151)), warned) << "a constraint is missing";
+  EXPECT_THAT(note_of(scores_of(0.0147, 0.034, 0.196, 0.923, 60)), ElementsAre(StartsWith("stretches"))) << "few rows";
+  EXPECT_THAT(note_of(scores_of(0.0132, 0.018, 0.276, 0.93, 121)), ElementsAre(StartsWith("stretches")))
+      << "sound: one motion, whose ends are unlike its middle";
+  EXPECT_THAT(note_of(scores_of(0.0147, 0.0221, 0.0509, 0.909, 151)), ElementsAre(StartsWith("stretches")))
+      << "a potential for a force that dissipates";
+  EXPECT_THAT(note_of(scores_of(0.0189, 0.024, 0.029, 0.871, 205)), ElementsAre(StartsWith("stretches"))) << "5 % of a mass";
+  EXPECT_THAT(note_of(scores_of(0.0222, 0.186, 0.182, 0.92, 201)),
+              ElementsAre(StartsWith("rows left out one by one are predicted far worse than the noise: nrmse 0.19")));
+  EXPECT_THAT(note_of(scores_of(0.0045, 0.036, 0.036, 0.985, 101)), testing::IsEmpty()) << "sound: friction jumps";
+  EXPECT_THAT(note_of(scores_of(0.0222, 0.604, 0.542, 0.928, 201)), ElementsAre(StartsWith("warning: of stretches of the log")));
+  EXPECT_THAT(
+      note_of(scores_of(0.01, 5000, 37000, 0.31, 201)),
+      ElementsAre(AllOf(StartsWith("warning: of stretches"), HasSubstr("the fit says little, worse than their mean would"))));
+  CrossValidation rows = scores_of(0.01, 1.2, 0, 0, 60);
+  rows.stretches.reset();
+  EXPECT_THAT(note_of(rows), ElementsAre(StartsWith("warning: of rows left out one by one the fit says little, worse than")));
+  rows.residuals.emplace_back().n_far = 1;
+  EXPECT_THAT(note_of(rows), testing::IsEmpty()) << "single values are told by themselves";
+}
+
+TEST(FitNotes, NameCausesThatTheModelCanHave) {
+  const auto causes = [](const std::string& inputs, const std::string& directions) {
+    return note_of(scores_of(0.01, 0.011, 0.2, 0.9, 100), prior_of_cart(inputs, directions)).at(0);
+  };
+  EXPECT_THAT(causes("", "force"),
+              AllOf(Not(HasSubstr("input")), Not(HasSubstr("potential")), HasSubstr("a constraint that is")));
+  EXPECT_THAT(causes("inputs = ['u']\n", "force"), HasSubstr("an input that is clipped"));
+  EXPECT_THAT(causes("", "potential"), HasSubstr("a force that dissipates, which a potential does not"));
+}
+
+TrainingResidual residual_of(int n, double rms, double coverage95) {
+  TrainingResidual one;
+  one.n = n;
+  one.rms = rms;
+  one.coverage95 = coverage95;
+  return one;
+}
+
+TEST(FitNotes, CountACoverageThatIsTooLowByManyDeviations) {
+  EXPECT_TRUE(residual_of(201, 1.66, 0.78).is_too_large());
+  EXPECT_TRUE(residual_of(20, 2.6, 0.8).is_too_large());
+  EXPECT_FALSE(residual_of(40, 1.8, 0.85).is_too_large()) << "hyperparameters of few rows are that sure of themselves";
+  EXPECT_FALSE(residual_of(100, 1.3, 0.87).is_too_large());
+  EXPECT_FALSE(residual_of(100000, 1.2, 0.92).is_too_large()) << "noise that is not quite normal";
+}
+
+TEST(FitNotes, TellWhereResidualsThatLastAreMoreThanNoise) {
+  TrainingResidual one = residual_of(200, 1.1, 0.94);
+  one.output = "ddy";
+  one.serial_correlation = 0.75;
+  one.rms_in_noise = 1.2;
+  EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("something that lasts longer than a sample")));
+  EXPECT_FALSE(last_beyond_noise({one}));
+  one.rms_in_noise = 3.9;
+  EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("3.9 times the noise: a mass, a length")));
+  EXPECT_TRUE(last_beyond_noise({one}));
+}
+
+TEST(FitNotes, NameWhatMayBeBehindSingleValuesAndWhereTheyStand) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
+  FitOptions nothing;
+  nothing.max_iterations = 0;
+  const Posterior posterior = fit(problem_of(constrained_cart(""), log), nothing).posterior;
+  TrainingResidual one = residual_of(200, 1.9, 0.9);
+  one.output = "ddx";
+  one.n_far = 5;
+  one.farthest = 9.2;
+  one.farthest_state = 1;
+  const auto note_under = [&](double rms_in_noise, const std::vector<std::vector<int>>& lines) {
+    one.rms_in_noise = rms_in_noise;
+    std::vector<std::string> notes;
+    add_residual_notes(posterior, {posterior.observations(), lines}, {one}, notes);
+    return notes;
+  };
+  EXPECT_THAT(note_under(2, {{5, 9}}), ElementsAre(HasSubstr("up to 9.2 (ddx, in line 9): outliers of the log")));
+  EXPECT_THAT(note_under(2, {}), ElementsAre(HasSubstr("up to 9.2 (ddx, in row 2): outliers")));
+  EXPECT_THAT(note_under(12, {{5, 9}}), ElementsAre(HasSubstr("(ddx, in line 9): a mass, a length or a force that is wrong")));
 }
 
 TEST(FitNotes, NameGrossErrorsByTheirLines) {

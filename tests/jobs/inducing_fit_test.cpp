@@ -214,23 +214,32 @@ TEST(InducingFit, HyperparametersDrawnFromSomeRowsMixWhatAllTell) {
   }
 }
 
+std::vector<int> distrusted_states(int n, const std::vector<int>& wrong, double inducing, int max_iterations) {
+  test::LogData log = test::drawn_log(surface, n, 4);
+  for (const int i : wrong) log.accelerations(1, i) += 30;
+  FitRequest request = request_of_rows(12);
+  request.logs = {{log.table(), nullptr}};
+  request.problem.robust = true;
+  request.inducing = inducing;
+  request.max_iterations = max_iterations;
+  const FitReport report = run_fit(prepare_fit(std::move(request))).file.report;
+  EXPECT_EQ(report.inducing.has_value(), inducing < 2 * n);
+  std::vector<int> states;
+  for (const DistrustedValue& value : report.distrusted) states.push_back(value.state);
+  std::sort(states.begin(), states.end());
+  return states;
+}
+
 TEST(InducingFit, OfARobustOneDistrustsTheSame) {
-  const auto distrusted = [](double inducing) {
-    test::LogData log = test::drawn_log(surface, 200, 4);
-    for (int i = 10; i < 200; i += 50) log.accelerations(1, i) += 30;
-    FitRequest request = request_of_rows(12);
-    request.logs = {{log.table(), nullptr}};
-    request.problem.robust = true;
-    request.inducing = inducing;
-    const FitReport report = run_fit(prepare_fit(std::move(request))).file.report;
-    EXPECT_EQ(report.inducing.has_value(), inducing < 400);
-    std::vector<int> states;
-    for (const DistrustedValue& value : report.distrusted) states.push_back(value.state);
-    std::sort(states.begin(), states.end());
-    return states;
-  };
-  EXPECT_THAT(distrusted(100), testing::ElementsAre(10, 60, 110, 160));
-  EXPECT_THAT(distrusted(1000), testing::ElementsAre(10, 60, 110, 160));
+  const std::vector<int> wrong{10, 60, 110, 160};
+  EXPECT_EQ(distrusted_states(200, wrong, 100, 1000), wrong);
+  EXPECT_EQ(distrusted_states(200, wrong, 1000, 1000), wrong);
+}
+
+// of which every second is kept
+TEST(InducingFit, OfARobustOneOf6000RowsDistrustsThoseThatAreNotKeptToo) {
+  const std::vector<int> wrong{10, 1001, 2002, 5999};
+  EXPECT_THAT(distrusted_states(6000, wrong, 40, 5), testing::IsSupersetOf(wrong));
 }
 
 }  // namespace

@@ -146,6 +146,21 @@ TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {
   EXPECT_FALSE(pile_up(RowVectorXd::Constant(300, 2))) << "constant";
 }
 
+TEST(FarValues, AreThoseFarBeyondAllOthers) {
+  std::mt19937 random(4);
+  std::normal_distribution<double> normal(0, 1);
+  RowVectorXd values(300);
+  for (double& one : values) one = normal(random);
+  EXPECT_THAT(far_values(values), IsEmpty());
+  values[7] = std::nan("");
+  values[250] = 1e6;
+  EXPECT_THAT(far_values(values), testing::ElementsAre(250));
+  RowVectorXd pulses = RowVectorXd::Zero(300);
+  pulses[12] = 50;
+  EXPECT_THAT(far_values(pulses), IsEmpty()) << "an input that rests but for a pulse";
+  EXPECT_THAT(far_values(values.head(10)), IsEmpty()) << "too few";
+}
+
 TEST(WrappedDegrees, AreToldFromRadAndFromDegreesThatDoNotWrap) {
   std::vector<double> degrees, positive, unwrapped, rad;
   for (int k = 0; k < 400; ++k) {

@@ -6,6 +6,7 @@
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/simulate_job.hpp"
 #include "gp2/jobs/update_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
@@ -43,6 +44,13 @@ std::vector<std::string> findings_of(const Data& data, Finding::Level level) {
     if (finding.level == level) texts.push_back(finding.text);
   }
   return texts;
+}
+
+std::vector<std::string> notes_of(const std::vector<std::string>& notes, const std::string& about) {
+  std::vector<std::string> out;
+  std::copy_if(notes.begin(), notes.end(), std::back_inserter(out),
+               [&](const std::string& note) { return note.find(about) != std::string::npos; });
+  return out;
 }
 
 constexpr const char* of_fit = "values lie farther than noise from what all others predict";
@@ -148,6 +156,73 @@ TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
   EXPECT_EQ(again.file.report.objective, fewer.file.report.objective);
 }
 
+TEST(Residuals, ThatDenyAConstraintAreNotThinned) {
+  LastingErrors log(300, 0.9);
+  log.data.accelerations.row(2).array() += 9.81;
+  const FitOutcome outcome = log.fit(true);
+  EXPECT_EQ(n_rows(outcome), 300);
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr(of_constraint)));
+  EXPECT_THAT(outcome.notes, Not(Contains(HasSubstr("evenly taken"))));
+}
+
+// A sledge of 2 kg on a spring, which its model takes for one of `mass`. Its motion is known, and the force that makes it but for an
+// `unlogged` one.
+FitOutcome fit_of_sledge(double mass, double unlogged = 0) {
+  const Model model = Model::parse(fmt::format(R"toml(
+coordinates = ["y"]
+inputs = ["f"]
+[mechanics]
+mass  = [["{}"]]
+force = ["f"]
+[noise]
+ddq = 0.05
+[[latent]]
+kernel     = "se"
+features   = ["y", "dy"]
+directions = "force"
+)toml",
+                                               mass),
+                                   "sledge.toml");
+  std::string log = "t,y,dy,f,ddy\n";
+  RandomStream random(54);
+  for (int k = 0; k < 200; ++k) {
+    const double t = 0.05 * k, y = std::sin(t) + 0.4 * std::sin(2.7 * t), dy = std::cos(t) + 1.08 * std::cos(2.7 * t);
+    const double ddy = -std::sin(t) - 2.916 * std::sin(2.7 * t), f = 2 * ddy + 2 * dy + 3 * y - unlogged * std::sin(1.7 * t);
+    log += fmt::format("{},{},{},{},{}\n", t, y, dy, f, ddy + 0.05 * random.normal());
+  }
+  FitRequest request;
+  request.model = model;
+  request.logs = {{CsvTable::parse(log, "sledge.csv")}};
+  request.problem.mean = Prior::Mean::force;
+  request.restarts = 1;
+  return run_fit(prepare_fit(std::move(request)));
+}
+
+TEST(Residuals, TellOfAMassThatIsWrong) {
+  EXPECT_THAT(notes_of(fit_of_sledge(2).notes, "left out"), testing::IsEmpty());
+  EXPECT_THAT(notes_of(fit_of_sledge(2).notes, "warning: "), testing::IsEmpty());
+  EXPECT_THAT(notes_of(fit_of_sledge(2.1).notes, "warning: "), Contains(HasSubstr(of_fit)));
+  EXPECT_THAT(notes_of(fit_of_sledge(2.6).notes, "warning: "), Contains(HasSubstr("a mass, a length")));
+}
+
+TEST(Residuals, OfFewerRowsAreSaidOnce) {
+  const FitOutcome outcome = fit_of_sledge(2, 0.2);
+  EXPECT_LT(n_rows(outcome), 200);
+  EXPECT_EQ(notes_of(outcome.notes, of_fit).size(), 1U);
+}
+
+TEST(Residuals, OfARowThatStandsAloneHaveNoScale) {
+  Data data = test::drawn_log("models/surface.toml", 2, 53);
+  data.states = data.states.leftCols(1).eval();
+  data.accelerations = data.accelerations.leftCols(1).eval();
+  FitRequest request;
+  request.model = *data.model;
+  request.logs = {{data.table()}};
+  request.max_iterations = 0;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_THAT(outcome.cross_validation->text(), testing::StartsWith("left out one by one: 95 % coverage "));
+}
+
 TEST(Residuals, OfALongLogAreAskedOfAStretchFirst) {
   const LastingErrors lasting(1500, 0.9);
   const FitOutcome fewer = lasting.fit(true);  // all would take a matrix of 3000
@@ -246,13 +321,6 @@ w  = [-3, 3]
   }
   [[nodiscard]] Eigen::Index row_of(int input) const { return model.system->layout().u(input); }
 };
-
-std::vector<std::string> notes_of(const std::vector<std::string>& notes, const std::string& about) {
-  std::vector<std::string> out;
-  std::copy_if(notes.begin(), notes.end(), std::back_inserter(out),
-               [&](const std::string& note) { return note.find(about) != std::string::npos; });
-  return out;
-}
 
 TEST(Residuals, TellOfAnInputThatActsOtherwiseThanLogged) {
   const Driven driven;
@@ -384,8 +452,8 @@ TEST(Residuals, TellOfSingleValuesThatAreFarOff) {
     EXPECT_THAT(notes_of_fit(data), Not(Contains(HasSubstr("of the values lie"))));
     data.accelerations(1, 17) += 20 * 0.1;
     EXPECT_THAT(notes_of(notes_of_fit(data), "of the values lie"),
-                testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: "),
-                                                    HasSubstr("(ddq2, at row 18 of what is learned from log 1)"))));
+                testing::ElementsAre(
+                    testing::AllOf(testing::StartsWith("warning: "), HasSubstr("(ddq2, in line 19): outliers of the log"))));
   }
 }
 
@@ -399,12 +467,87 @@ TEST(Residuals, TellOfAnInputThatActsLate) {
     request.restarts = 1;
     return notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input ");
   };
-  // by how many rows depends on the optimum: a fit of late data takes some of it up
   EXPECT_THAT(notes_of_delay(0, 0), testing::IsEmpty());
   EXPECT_THAT(notes_of_delay(0.001, 0), testing::IsEmpty()) << "a tenth of a row";
-  EXPECT_THAT(notes_of_delay(0.04, 0), testing::ElementsAre(HasSubstr("later than logged")));
+  EXPECT_THAT(notes_of_delay(0.03, 0), testing::ElementsAre(HasSubstr("it acts 3 rows later than logged")));
+  EXPECT_THAT(notes_of_delay(0.04, 0), testing::ElementsAre(HasSubstr("it acts 4 rows later than logged")));
   EXPECT_THAT(notes_of_delay(0.02, 0.02), testing::ElementsAre(HasSubstr("later than logged")));
   EXPECT_THAT(notes_of_delay(0.04, 0, 150), Not(Contains(HasSubstr("later than logged")))) << "rows in no order";
+  EXPECT_THAT(notes_of_delay(0.2, 0), Not(Contains(HasSubstr(" than logged")))) << "20 rows, and 16 are tried";
+}
+
+TEST(Residuals, TellOfInputsThatAreSwapped) {
+  const Driven driven("2*u");
+  for (const std::uint64_t seed : {31U, 32U}) {
+    Data data = driven.data(seed);
+    data.states.row(driven.row_of(0)).swap(data.states.row(driven.row_of(1)));
+    EXPECT_THAT(notes_of(notes_of_fit(data), "the input "), testing::ElementsAre(HasSubstr("are exchanged, by ")));
+  }
+}
+
+// A delay mends some of the misfit of nearly any wrong model.
+TEST(Residuals, BlameNoDelayForAWrongModel) {
+  const auto two_masses = [](const char* force_of_spring) {
+    return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y"]
+inputs = ["u"]
+[mechanics]
+mass = [["1.5", "0"], ["0", "0.7"]]
+force = ["u", "0"]
+[[latent]]
+name = "spring"
+features = ["x - y"]
+directions = {{ force = [["1"], ["{}"]] }}
+[[latent]]
+name = "drag"
+features = ["dy"]
+directions = {{ force = [["0"], ["1"]] }}
+[noise]
+ddq = 0.1
+[truth]
+force = ["-60*(x - y) - 0.5*dx", "60*(x - y) - 0.4*dy"]
+)toml",
+                                    force_of_spring),
+                        "two_masses.toml");
+  };
+  SimulateRequest motion;
+  motion.times = Eigen::VectorXd::LinSpaced(201, 0, 10);
+  motion.start = std::map<std::string, double>{{"x", 0}, {"y", 0.1}, {"dx", 0}, {"dy", 0}};
+  const Eigen::VectorXd u = 9 * (5.2 * motion.times.array() + 1).sin() + 6 * (11.3 * motion.times.array()).sin();
+  const auto column = [](const auto& row) { return std::vector<double>(row.begin(), row.end()); };
+  motion.inputs = CsvTable::from_columns("commands", {{"t", column(motion.times)}, {"u", column(u)}});
+  const Model right = two_masses("-1"), wrong = two_masses("1");
+  const Trajectory run = run_simulation(prepare_simulation(right, motion)).front();
+  RandomStream random(61);
+  Eigen::MatrixXd ddq = run.accelerations;
+  for (double& one : ddq.reshaped()) one += 0.1 * random.normal();
+  const CsvTable log = CsvTable::from_columns("log", {{"t", column(motion.times)},
+                                                      {"x", column(run.states.row(0))},
+                                                      {"y", column(run.states.row(1))},
+                                                      {"dx", column(run.states.row(2))},
+                                                      {"dy", column(run.states.row(3))},
+                                                      {"ddx", column(ddq.row(0))},
+                                                      {"ddy", column(ddq.row(1))},
+                                                      {"u", column(u)}});
+  const auto notes_under = [&](const Model& model) {
+    FitRequest request;
+    request.model = model;
+    request.logs = {{log}};
+    request.problem.mean = Prior::Mean::force;
+    request.restarts = 1;
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input u");
+  };
+  EXPECT_THAT(notes_under(right), testing::IsEmpty());
+  EXPECT_THAT(notes_under(wrong), testing::ElementsAre(HasSubstr("the model does not explain what the input u does")));
+}
+
+TEST(Residuals, NameSingleValuesOfAnInput) {
+  const Driven driven;
+  Data data = driven.data(38);
+  data.states(driven.row_of(0), 17) = 1e6;
+  EXPECT_THAT(notes_of(notes_of_fit(data), "the input "),
+              testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: single values of the input u lie far"),
+                                                  HasSubstr(": 1e+06 at row 18. Mend"))));
 }
 
 TEST(Residuals, TellOfRowsThatStandInTwoLogs) {

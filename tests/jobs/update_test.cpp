@@ -151,7 +151,9 @@ TEST(UpdateJob, WhatCannotBeIsAnError) {
   UpdateRequest none_left, fading, silent, unknown;
   silent.noise_stddev = 0;
   unknown.observe = {"ddq9"};
-  EXPECT_EQ(refused(silent), "`noise_std`: must be positive and finite, got 0");
+  EXPECT_EQ(refused(silent), "`noise_std`: must be positive and at most 1e+100, got 0");
+  silent.noise_stddev = 1e300;
+  EXPECT_EQ(refused(silent), "`noise_std`: must be positive and at most 1e+100, got 1e+300");
   silent.noise_stddev = 1e-12;
   EXPECT_THAT(refused(silent), HasSubstr("the noise standard deviation 1e-12 of ddq1 is too small for double precision"));
   EXPECT_THAT(refused(unknown), HasSubstr("`observe`: 'ddq9' is not an acceleration of "));

@@ -8,7 +8,9 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/predictor.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "input_error.hpp"
 #include "io_testing.hpp"
+#include "prior/admissible_directions.hpp"
 #include "test_models.hpp"
 
 // The small latent beside the model's one: when a fit has it, how large it is, and that a fit file keeps it.
@@ -279,6 +281,15 @@ TEST(Discrepancy, FollowsTheParametersOfTheConstraintAndTheState) {
         }
       }
     }
+  }
+}
+
+TEST(Discrepancy, OfDeviationsThatHaveNoSquaresIsAnError) {
+  const Eigen::RowVector2d A(1, 1);
+  EXPECT_TRUE(AdmissibleDirections(Eigen::Vector2d(1e-100, 1e-99)).compute(A).allFinite());
+  EXPECT_TRUE(AdmissibleDirections(Eigen::Vector2d(1e100, 1e99)).compute(A).allFinite());
+  for (const double size : {1e170, 1e300}) {
+    EXPECT_THROW(AdmissibleDirections(Eigen::Vector2d(size, size)).compute(A), NumericalError);
   }
 }
 

@@ -411,6 +411,8 @@ std::vector<Complaint> complaints() {
        "4: parameters.m: a parameter that follows from others has no bounds, no prior and no estimate of its own: write m = "
        "\"2*n\", and say of those others what is to be estimated"},
       {"ParameterIsInfinite", with_parameter("m = inf"), "4: parameters.m: expected a finite number, got inf"},
+      {"ParameterHasNoSquare", with_parameter("m = -1e300"),
+       "4: parameters.m: -1e+300 is too large: at most 1e+100 can be computed with"},
       {"PriorOfAParameterHalfGiven", with_parameter("m = { value = 2, prior = { mean = 2 } }"),
        "4: parameters.m.prior: missing stddev; write { mean = 2.0, stddev = 0.1 }, or, of a positive one, { median = 2.0, "
        "log_stddev = 0.1 }, the second of its logarithm"},

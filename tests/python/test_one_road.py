@@ -83,7 +83,7 @@ def test_a_view_is_chosen_by_one_function(posterior, arm_fit_file, command, arm_
 
 
 def test_show_of_a_fit_is_what_the_command_prints(command, arm, arm_log, tmp_path):
-    posterior = gp2.fit(arm, arm_log, restarts=1, max_iterations=2, max_escapes=0, standard_errors=False)
+    posterior = gp2.fit(arm, arm_log, mean="force", restarts=1, max_iterations=2, max_escapes=0, standard_errors=False)
     posterior.save(tmp_path / "fit.json")
     shown = command("show", tmp_path / "fit.json").stdout
     assert shown.startswith("learned from ") and "negative log likelihood" in shown and "mass matrix M" in shown

@@ -27,6 +27,18 @@ def test_an_unknown_keyword_is_refused_with_the_nearest(arm, arm_log):
         gp2.System(coordinates=["x"], mass=[[1]], unit={"x": "m"})
 
 
+def test_a_truth_value_is_no_number_and_a_number_no_truth_value(arm, arm_log):
+    for name, value, expected in [
+        ("noise_std", True, "a positive number, 'estimate'"),
+        ("restarts", np.True_, "a whole number"),
+        ("robust", 2, "True or False"),
+        ("standard_errors", 0.0, "True or False"),
+    ]:
+        with pytest.raises(TypeError, match=f"^{name}: expected {expected}"):
+            gp2.fit(arm, arm_log, **{name: value})
+    gp2.fit(arm, arm_log, max_iterations=0, robust=np.False_)
+
+
 @pytest.mark.parametrize(
     ("keyword", "value"),
     [("drawing", [1]), ("units", "m"), ("parameters", ["m"]), ("latents", {"features": ["x"]}), ("latents", ["x"])],

@@ -76,7 +76,7 @@ def test_names_stay_text_in_the_picture():
 
 def test_matplotlib_draws_what_was_learned(posterior):
     ax = posterior.plot_learned("friction of the tip", along="dshoulder", force="shoulder")
-    assert ax.get_xlabel() == "dshoulder" and ax.get_ylabel() == "force_shoulder"
+    assert ax.get_xlabel() == "dshoulder [rad/s]" and ax.get_ylabel() == "force_shoulder [N m]"
     assert posterior.plot_learned(ax=ax) is ax
 
 

@@ -59,3 +59,20 @@ def test_columns_and_a_system_without_data_are_refused(posterior, arm, tmp_path)
     with pytest.raises(gp2.InputError, match="nowhere.json"):
         gp2.report(tmp_path / "nowhere.json", tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
+
+
+def test_a_file_remembers_the_notes_of_its_fit(arm, arm_log, tmp_path):
+    fitted = gp2.fit(arm, arm_log, restarts=1)
+    fitted.save(tmp_path / "fit.json")
+    loaded = gp2.load(tmp_path / "fit.json")
+    assert loaded.notes == [note for note in fitted.notes if note in loaded.notes]
+    assert json.loads(gp2.show(loaded, json=True))["fit"]["notes"] == loaded.notes
+    advice = [(one["text"] + " " + one["mend"]).strip() for one in data_of(gp2.report(loaded))["advice"]]
+    for note in loaded.notes:
+        assert note.removeprefix("warning: ").rstrip(".") + "." in advice
+
+
+def test_a_picture_is_svg_whatever_it_is_called(posterior, tmp_path):
+    with pytest.raises(gp2.InputError, match="the picture is SVG"):
+        gp2.plot(posterior, tmp_path / "tip.png")
+    assert not (tmp_path / "tip.png").exists()

@@ -225,7 +225,7 @@ def test_columns_of_frames_are_unknown_missing_or_given_twice(data, model):
             use(twice)
         with pytest.raises(gp2.InputError, match="^X: episode: no part of a state of 'bead on a wire': x, z, dx, dz, t, push$"):
             use(frame.assign(episode=0))
-    with pytest.raises(gp2.InputError, match="dz"):
+    with pytest.raises(gp2.InputError, match="^states: missing column 'dz'"):
         model.predict(frame.drop(columns="dz"))
     accelerations = pd.DataFrame(y[:, [0, 1, 1]], columns=["ddx", "ddz", "ddz"])
     for use in (model.score, estimator.fit, GP2Regressor(WIRE, observe="ddx").fit):

@@ -129,7 +129,8 @@ for (const model of ["surface", "duffing", "unicycle"]) {
       assert.equal(actual.length, expected.length, name);
       actual.forEach((value, k) => assert.ok(Math.abs(value - expected[k]) <= 1e-9 * Math.abs(expected[k]), `${name}: ${value}, ${expected[k]}`));
     };
-    for (const output of Object.keys(told[0].rmse)) near(figures[`rmse ${output}`], row((e) => e.rmse[output]), output);
+    const units = await page.evaluate(() => JSON.parse(document.getElementById("report").textContent)[0].model.units);
+    for (const output of Object.keys(told[0].rmse)) near(figures[`rmse ${output}${output in units ? ` [${units[output]}]` : ""}`], row((e) => e.rmse[output]), output);
     near(figures["rmse / training std"], row((e) => e.rmse_normalised), "rmse_normalised");
     near(figures["nrmse"], row((e) => e.nrmse), "nrmse");
     near(figures["nlpd, with noise"], row((e) => e.nlpd), "nlpd");
@@ -154,6 +155,7 @@ test("two fits stand side by side, and each has the page below", async () => {
     }
     const best = await page.locator("#comparison-scores tr", { hasText: "nrmse" }).locator(".best").getAttribute("data-value");
     assert.equal(Number(best), Math.min(...scores.nrmse));
+    assert.equal(await page.locator("#comparison-scores tr", { hasText: "without noise" }).locator(".best").count(), 0);
     assert.ok((await page.locator("#comparison-charts canvas").count()) > 0);
     assert.equal(await page.locator("#comparison-parameters").count(), 0, "no parameter was estimated");
     assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), width);
@@ -171,6 +173,16 @@ test("two fits stand side by side, and each has the page below", async () => {
       await settled(page);
       await page.emulateMedia({ colorScheme: scheme });
     }
+    await close();
+  }
+});
+
+test("fits that were not scored on the same test are not told apart", async () => {
+  for (const [fits, why] of [[["surface", "surface"], "not scored on the same test data"], [["surface", "duffing"], "of different systems"]]) {
+    gp2("report", ...fits.map((name) => `${name}.json`), "-o", "apart.html");
+    const { page, close } = await open("apart.html");
+    assert.equal(await page.locator("#comparison-scores .best").count(), 0);
+    assert.ok((await page.locator("#comparison-scores p").textContent()).includes(why), why);
     await close();
   }
 });

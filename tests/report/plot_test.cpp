@@ -90,5 +90,20 @@ TEST(Plot, IsAPictureOfACurveThatIsFlatAndCertain) {
   EXPECT_THAT(picture, testing::AllOf(HasSubstr(">dx [m/s]<"), HasSubstr(">force_x [N]<")));
 }
 
+TEST(Plot, KnowsTheUnitsOfAnglesWithoutBeingTold) {
+  const Model model = Model::parse(
+      "coordinates = [{ name = 'phi', angle = true }, 'x']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n", "m.toml");
+  EXPECT_EQ(model.labelled("ddphi"), "ddphi [rad/s²]");
+  EXPECT_EQ(model.labelled("force_phi@friction"), "force_phi@friction [N m]");
+  EXPECT_EQ(model.labelled("dx"), "dx");
+}
+
+TEST_F(PlotCommand, RefusesThePictureOfAnotherKind) {
+  const Outcome outcome = desk.run("gp2 plot fit.json -o tip.png");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_THAT(outcome.err, HasSubstr("tip.png: the picture is SVG: name a file that ends in .svg"));
+  EXPECT_FALSE(desk.has("tip.png"));
+}
+
 }  // namespace
 }  // namespace gp2::test

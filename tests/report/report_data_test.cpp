@@ -1,5 +1,6 @@
 #include "gp2/report/report_page.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <numbers>
@@ -194,6 +195,29 @@ TEST_F(ReportOf, ShowsTheForceThatWasLearnedAlongWhatItDependsOn) {
   const auto curves = nlohmann::json::parse(report_json({r}, with_flags))[0]["learned"];
   EXPECT_EQ(curves.size(), 3 * r.learned.size());
   EXPECT_NEAR(curves[1]["mean"][60], r.learned[0].mean(1, 60), 1e-5 * std::abs(r.learned[0].mean(1, 60)));
+}
+
+TEST_F(ReportOf, SaysWhatTheFitSaidAndOfAFileWithoutNotesWhatItsDataTell) {
+  desk.done("gp2 generate models/surface.toml --n 40 --seed 1 --noise-std 0.05 -o sound.csv");
+  const CsvTable log = CsvTable::read(desk / "sound.csv");
+  std::string csv = desk.read("sound.csv");
+  const std::vector<std::string>& header = log.header();
+  const std::string cell = log.cell(20, static_cast<int>(std::ranges::find(header, "ddq1") - header.begin()));
+  csv.replace(csv.find(cell), cell.size(), "30");
+  desk.write("train.csv", csv);
+  const std::string said = desk.done("gp2 fit models/surface.toml --data train.csv --restarts 1 --mean force -o fit.json").err;
+  ASSERT_THAT(said, HasSubstr("six deviations or more"));
+  FitFile file = FitFile::read(desk / "fit.json");
+  ASSERT_TRUE(file.notes);
+  for (const std::string& note : *file.notes) EXPECT_THAT(said, HasSubstr(with_flags(note)));
+  EXPECT_THAT(desk.done("gp2 show fit.json").out, HasSubstr("six deviations or more"));
+  std::vector<std::string> notes;
+  const Posterior posterior = file.posterior();
+  EXPECT_EQ(collect_report(file, posterior, {}, notes).notes, *file.notes);
+  file.notes.reset();
+  EXPECT_THAT(collect_report(file, posterior, {}, notes).notes, testing::Contains(HasSubstr("six deviations or more")));
+  desk.done("gp2 update fit.json --data sound.csv -o more.json");
+  EXPECT_FALSE(FitFile::read(desk / "more.json").notes) << "they are of the data that there were";
 }
 
 TEST_F(ReportOf, SeesThatComputedAccelerationsFollowFromEachOther) {

@@ -774,6 +774,9 @@ TEST(UrdfErrors, FaultsOfTheTreeAreNamed) {
             "robot.xml: link 'hand': it is the child of two joints; a loop is closed in MJCF, with <equality><connect>");
   EXPECT_EQ(error_of(urdf(three + joint("a", "revolute", "arm", "hand") + joint("b", "revolute", "hand", "arm"))),
             "robot.xml: link 'arm': it is its own ancestor");
+  EXPECT_EQ(error_of(urdf(three + link("tool") + joint("a", "revolute", "base", "arm"))),
+            "robot.xml: no joint has the links base, hand, tool as its child; a URDF has one root: join the others by a <joint>, "
+            "with type=\"fixed\" where they do not move, or remove them");
   EXPECT_EQ(error_of(urdf(three + R"(<joint name="a" type="fixed"><child link="arm"/></joint>)")),
             "robot.xml: joint 'a': it has no <parent link=\"…\"/>");
   EXPECT_EQ(error_of(urdf(R"(<link/>)")), "robot.xml: a <link> has no name");

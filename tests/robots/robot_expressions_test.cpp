@@ -539,6 +539,17 @@ TEST(RobotModel, SaysWhatIsWrong) {
   expect("[constraints]\nposition = ['site(\"tip\") + 1']", "where a component must stand");
   expect("[parameters]\nm = { of = 'mass(\"link8\")' }", "the robot has no number 'mass(\"link8\")'");
   expect("[parameters]\nm = { of = 'mass(\"link7\")' }\nm2 = { of = 'mass(\"link7\")' }", "is the parameter 'm' already");
+  const std::string of_inertia = "[parameters]\nI = { of = 'inertia(\"link7\")";
+  expect("[parameters]\nm = { of = 'mass(\"link7\")', value = -0.3 }", "parameters.m: mass(\"link7\") must be ≥ 0, got -0.3");
+  expect("[parameters]\nm = { of = 'mass(\"link7\")', bounds = [-1, 4] }",
+         "parameters.m: mass(\"link7\") must be ≥ 0, and its bounds start at -1");
+  expect("[parameters]\nd = { of = 'damping(\"q1\")', value = -1 }", "damping(\"q1\") must be ≥ 0, got -1");
+  expect(of_inertia + ".yy', value = -0.02 }", "inertia(\"link7\").yy must be ≥ 0, got -0.02");
+  expect(of_inertia + ".xy', value = 0.1, estimate = true }", "body 'link7': its inertia has the principal moment -");
+  expect(of_inertia + ".yy', value = 0.1 }", "body 'link7': no rigid body has such an inertia, of which one principal moment");
+  EXPECT_EQ(message(of_inertia + ".yy', value = 0.1, estimate = true }"), "") << "one moment alone acts in a plane";
+  EXPECT_EQ(message(of_inertia + ".xy', value = -1e-4 }"), "");
+  EXPECT_EQ(message("[parameters]\nc = { of = 'com(\"link7\").x', value = -0.1, bounds = [-1, 1] }"), "");
   expect("[truth]\nforce_on = { 'q1 + q2' = '1' }", "expected a point of the robot");
   expect("[truth]\nforce_on = { 'site(\"tpi\").x' = '1' }", "has no site 'tpi'");
   expect("[truth]\nforce_on = { 'site(\"tip\").x' = 'ddq1' }", "a force may not depend on accelerations");

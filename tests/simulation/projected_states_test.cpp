@@ -145,5 +145,29 @@ position = ["sqrt(x^2 + y^2) - 1"]
   EXPECT_TRUE(check_states(*circle.system, states, VectorXd()).empty());
 }
 
+TEST(ProjectedStatesTest, ACheckJudgesEachConstraintByItself) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y", "z"]
+inputs = ["grip"]
+[mechanics]
+mass = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+[constraints]
+position = ["x - 2*y"]
+velocity = [{ expr = "dz - 1", when = "grip > 0.5" }]
+)toml",
+                                   "grip.toml");
+  MatrixXd states = MatrixXd::Zero(8, 6);
+  states.row(0) << 0, 1.00001, 2, 3, 4, 5;
+  states.row(1) = 0.5 * states.row(0).array().round();
+  states.row(5) << 1.2, 1.3, 5, 7, 6, 8;
+  states.row(7) << 1, 1, 0, 0, 0, 0;
+  const std::vector<Finding> findings = check_states(*model.system, states, VectorXd());
+  ASSERT_GE(findings.size(), 3U);
+  EXPECT_EQ(findings[0].level, Finding::Level::good) << findings[0].text;
+  EXPECT_EQ(findings[1].level, Finding::Level::good) << findings[1].text;
+  EXPECT_EQ(findings[2].level, Finding::Level::warning) << findings[2].text;
+  EXPECT_EQ(findings[2].text, "off the velocity constraint 'dz - 1' by 0.3 in the median, 0.3 at most (row 2)");
+}
+
 }  // namespace
 }  // namespace gp2

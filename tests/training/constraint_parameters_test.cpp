@@ -1,5 +1,6 @@
 // Parameters that vanish from A and b are found where the logged states are, or stay where they started.
 #include <cmath>
+#include <limits>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -100,7 +101,25 @@ TEST(ConstraintParameters, KeepTheirStartWhereNothingKnowsThem) {
   const std::vector<Found> found = fit_of(model, observe(model, 1e-3, 5), {"l", "p"});
   EXPECT_NEAR(found[0].value, 1, 0.01);
   EXPECT_NEAR(found[1].value, 0.7, 1e-3);
-  EXPECT_GT(found[1].stddev, 1) << "nothing is known of it";
+  EXPECT_TRUE(std::isinf(found[1].stddev)) << "nothing is known of it";
+}
+
+TEST(ConstraintParameters, HaveTheDeviationOfTheirPriorWhereNothingElseKnowsThem) {
+  const Model model = bead("x^2 + y^2 - l^2");
+  for (const auto& [belief, deviation] :
+       {std::pair("{ mean = 0.8, stddev = 0.1 }", 0.1), std::pair("{ median = 0.8, log_stddev = 0.1 }", 0.08),
+        std::pair("{ mean = 0.8, stddev = 5 }", std::numeric_limits<double>::infinity())}) {
+    std::string text = model.text;
+    text.replace(text.find("bounds = [0.1, 3]"), 17, fmt::format("bounds = [0.1, 3], prior = {}", belief));
+    const Model with = Model::parse(text, "bead");
+    const std::vector<Found> found = fit_of(with, observe(with, 1e-3, 5), {"l", "p"});
+    if (std::isfinite(deviation)) {
+      EXPECT_NEAR(found[1].value, 0.8, 1e-3) << belief;
+      EXPECT_NEAR(found[1].stddev, deviation, 1e-3) << belief;
+    } else {
+      EXPECT_EQ(found[1].stddev, deviation) << "a prior that is wider than the bounds";
+    }
+  }
 }
 
 // Else motions went by one draw of what is anywhere in its bounds.

@@ -312,8 +312,23 @@ TEST(LaplaceTest, APriorDeterminesWhatDataDoNot) {
   // nothing else speaks of r by itself: the posterior of it is its prior
   EXPECT_NEAR(report.hyperparameters.back().value, 0.1, 1e-3);
   EXPECT_NEAR(report.uncertainty->stddev[r], 0.05, 1e-3);
-  EXPECT_TRUE(uncertainty_notes(report).size() <= 1);
+  EXPECT_LE(uncertainty_notes(report).size(), 2U) << "of the prior, and of the single start";
   for (const UncertaintyNote& note : uncertainty_notes(report)) EXPECT_FALSE(note.is_warning) << note.text;
+}
+
+TEST(LaplaceTest, StandardErrorsOfASingleStartAreSaidToBe) {
+  const LaplaceProblem p = laplace_problem(line(), 20, {"p"});
+  const auto says_so = [&](int n_restarts) {
+    FitOptions options = one_run();
+    options.n_restarts = n_restarts;
+    const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+    const std::vector<UncertaintyNote> notes = uncertainty_notes(report);
+    return std::ranges::any_of(notes, [](const UncertaintyNote& note) {
+      return !note.is_warning && note.text == "the standard errors are those about the optimum of a single start";
+    });
+  };
+  EXPECT_TRUE(says_so(1));
+  EXPECT_FALSE(says_so(2));
 }
 
 TEST(LaplaceTest, NotesNameASingleOpenParameterManyCombinationsAndFitsThatStoppedEarly) {

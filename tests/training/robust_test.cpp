@@ -71,6 +71,27 @@ double error_of(const Data& data, const Posterior& posterior) {
   return evaluate_predictions(posterior, truth.states, rows, truth.accelerations).nrmse;
 }
 
+TEST(RobustTest, AValueThatHasNoSquareIsLeftOut) {
+  const Data data = data_of("models/unicycle.toml", 40);
+  for (const double absurd : {1e101, 1e160, 1e300}) {
+    MatrixXd values = data.observations.front().values();
+    values(1, 7) = -absurd;
+    const auto fit_of = [&](const std::vector<Observations>& observations) {
+      const std::vector<Observations> usual = without_gross_errors(observations);
+      return fit_robust(data.prior, observations, default_hyperparameters(data.prior, usual, {}, {}), quick_robust());
+    };
+    const Fit found = fit_of({data.observations.front().with_values(values)});
+    ASSERT_FALSE(found.report.distrusted.empty()) << absurd;
+    const DistrustedValue& first = found.report.distrusted.front();
+    EXPECT_EQ(std::pair(first.row, first.state), std::pair(1, 7));
+    EXPECT_GT(first.distance, absurd);
+    EXPECT_TRUE(std::isnan(found.posterior.observations().front().values()(1, 7)));
+
+    values(1, 7) = std::numeric_limits<double>::quiet_NaN();
+    EXPECT_EQ(found.report.objective, fit_of({data.observations.front().with_values(values)}).report.objective) << absurd;
+  }
+}
+
 TEST(RobustTest, OutliersAreFoundAndTheFitIsNearlyThatOfCleanData) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
     SCOPED_TRACE(fmt::format("{}, seed {}", file, robust_seed));

@@ -15,7 +15,7 @@ Eigen::VectorXd row_stddev(const Eigen::Ref<const Eigen::MatrixXd>& values);
 /// The entries of row k that are measured, in their order: those that are not NaN.
 std::vector<double> measured_entries(const Eigen::Ref<const Eigen::MatrixXd>& values, Eigen::Index k);
 /// The median of |x| under a normal distribution of mean 0 and standard deviation 1.
-inline constexpr double median_of_normal = 0.6745;
+inline constexpr double median_of_normal = 0.6744897501960817;
 
 /// The median of at least one value; of an even number the larger one of the two in the middle.
 double median(std::vector<double> values);

@@ -4,6 +4,7 @@
 #include <filesystem>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -46,6 +47,8 @@ struct FitFile {
   std::vector<std::shared_ptr<const Model>> systems;
   FitReport report;     // with the fitted hyperparameters
   std::string options;  // what was asked of the fit, a JSON object (options_json); empty: not known
+  /// What the fit said of itself and these data when it ended; nothing where it has not, or the data have changed since.
+  std::optional<std::vector<std::string>> notes;
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
   /// States that were fitted to, per Observations: more than `observations` have, where the file holds what they say in their place.

@@ -136,8 +136,9 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 
 /// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them. Its
 /// inputs are commands; where what acts depends on some before the log, accelerations count as not measured.
-/// @param actuators  not given: the model's
-/// @param projects   whether states are moved onto the constraints, as by a fit with `project`
+/// @param actuators   not given: the model's
+/// @param parameters  of the prior's system, by which states lie on the constraints or off them; not given: those of the model file
+/// @param projects    whether states are moved onto the constraints, as by a fit with `project`
 struct LogStates {
   Eigen::MatrixXd states;
   Eigen::MatrixXd accelerations;  // those asked for (accelerations × N); NaN: not measured
@@ -146,7 +147,8 @@ struct LogStates {
 };
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {},
-                          const std::optional<std::vector<Actuator>>& actuators = {}, bool projects = false);
+                          const std::optional<std::vector<Actuator>>& actuators = {},
+                          const std::optional<Eigen::VectorXd>& parameters = {}, bool projects = false);
 
 /// States of a log and the accelerations that are wanted there: those of ddq for which it has columns.
 struct WantedMotion {
@@ -155,9 +157,10 @@ struct WantedMotion {
   Eigen::MatrixXd accelerations;  // (view × N)
   std::vector<std::string> notes;
 };
+/// @param parameters  as read_log_states
 /// @throws InputError as read_log_states, but that other inputs need not be there; and where there is no acceleration.
 WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const CsvTable& log,
-                                const std::map<std::string, std::string>& columns);
+                                const std::map<std::string, std::string>& columns, const Eigen::VectorXd& parameters);
 
 /// work(), with the log named in what it throws: a posterior knows the number of a state only.
 template <typename Work>

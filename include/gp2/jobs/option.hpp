@@ -141,4 +141,7 @@ void read_options(const std::string& json, const std::vector<Option>& options, c
 std::string respelled(const std::string& message,
                       const std::function<std::string(const std::string&, const std::optional<std::string>&)>& spell);
 
+/// A face's way, of a whole message.
+using Spelling = std::function<std::string(const std::string& message)>;
+
 }  // namespace gp2

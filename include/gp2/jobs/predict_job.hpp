@@ -76,6 +76,11 @@ struct PredictOutcome {
   std::vector<std::string> notes;
 };
 
+/// @param free  as free_memory(); nothing: no limit
+/// @throws InputError where samples of a view at all states together take more
+void require_memory_of_samples(const Posterior& posterior, const View& view, Eigen::Index n_states, int n_samples,
+                               std::optional<double> free);
+
 /// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name; NumericalError as
 ///   inverse_dynamics.
 PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request);

@@ -133,6 +133,7 @@ struct Report {
   std::string library;    // the version that fitted
   std::string file_date;  // of the fit file, YYYY-MM-DD; empty: it is in no file
   std::vector<ReportData> data;
+  std::vector<std::string> notes;    // what the fit says of itself and its data
   CrossValidation cross_validation;  // of the training data
   std::vector<Relevance> relevance;
   std::vector<LearnedForce> learned;

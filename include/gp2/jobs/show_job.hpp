@@ -21,9 +21,9 @@ std::vector<Option> options(ShowRequest& request);
 /// @throws InputError where its mechanics are code; for `latex` and `json` together.
 std::string show(const Model& model, const ShowRequest& request = {});
 
-/// What a fit was learned from and what it found, before what its model means.
+/// What a fit was learned from, what it found and what it said of itself, before what its model means.
 /// @throws InputError as of a model.
-std::string show(const FitFile& fit, const ShowRequest& request = {});
+std::string show(const FitFile& fit, const ShowRequest& request, const Spelling& spelled);
 
 /// "position", "velocity" or "acceleration".
 const char* word_of(ConstraintRow::Level level);

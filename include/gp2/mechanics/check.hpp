@@ -18,7 +18,7 @@ struct Finding {
   std::string text;
 };
 
-/// The largest violation of a position- or velocity-level constraint over a batch of states.
+/// How far a batch of states is off a position- or velocity-level constraint; the root mean square is over those where it is active.
 struct ConstraintViolation {
   double relative = 0;  // |c| / Σ_j |A_j| spread(q_j), spread over the batch; velocities for velocity-level rows
   double rms = 0;       // the same, root mean square over the batch
@@ -32,6 +32,10 @@ inline constexpr double constraint_violation_tolerance = 1e-6;
 /// By more than this they deserve a warning.
 inline constexpr double large_constraint_violation = 1e-2;
 
+/// Of each residual label, in their order; NaN where the states lack what it reads.
+std::vector<ConstraintViolation> constraint_violations(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                       const Eigen::Ref<const Eigen::VectorXd>& parameters);
+/// The one that is relatively largest.
 /// @returns nothing when the system has no such constraint, or the states lack what it reads.
 std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                      const Eigen::Ref<const Eigen::VectorXd>& parameters);

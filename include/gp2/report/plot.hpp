@@ -1,5 +1,6 @@
 #pragma once
 
+#include <filesystem>
 #include <optional>
 #include <string>
 #include <vector>
@@ -29,6 +30,9 @@ struct LearnedCurve {
 
 /// @throws InputError where there is no such curve, naming those there are.
 LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& request);
+
+/// @throws InputError for a file whose name says that it is another kind of picture than SVG.
+void require_name_of_svg(const std::filesystem::path& path);
 
 /// The curve with its 95 % band, and the training data along the axis, as an SVG image that needs nothing else.
 /// @param model  of the fit: its name is the title, its units stand at the axes

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <functional>
 #include <string>
 #include <vector>
 
@@ -8,9 +7,6 @@
 #include "gp2/jobs/report_job.hpp"
 
 namespace gp2 GP2_API {
-
-/// How a face spells the options that a message names in backticks (respelled).
-using Spelling = std::function<std::string(const std::string& message)>;
 
 /// Reports for the page's script: a JSON array in which no text can end a script element.
 std::string report_json(const std::vector<Report>& reports, const Spelling& spelled);

@@ -33,6 +33,7 @@ struct Protocol {
     static constexpr double discrepancy_lengthscale = 1.25;  // of the feature's spread
     static constexpr double discrepancy_lower = 1e-3, discrepancy_upper = 10;
     static constexpr double discrepancy_median = 0.45, discrepancy_log_stddev = 0.15;  // of the noise
+    static constexpr double discrepancy_log_stddev_of_many = 1;                        // rows, which tell its size themselves
     static constexpr double start_log_stddev = 1.5;                                    // of random starts about the first one
   };
 };

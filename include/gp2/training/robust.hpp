@@ -9,7 +9,7 @@
 namespace gp2 GP2_API {
 
 /// The observations without values that lie farther than 10 robust standard deviations (1.48 times the median distance) from the
-/// median of their row: scales and starting points are not to be set by a sensor that lost contact.
+/// median of their row, or are above 1e100 in size: scales and starting points are not to be set by a sensor that lost contact.
 std::vector<Observations> without_gross_errors(std::vector<Observations> observations);
 /// Of values (d × N) alone: NaN takes the place of those.
 Eigen::MatrixXd without_gross_errors(const Eigen::MatrixXd& values);
@@ -26,7 +26,8 @@ struct RobustOptions {
 /// starts: outliers hide behind each other where a fit explains them all. The lower objective wins, plus what distrusting a value
 /// at the threshold lowers it by, for each. What all others say of a value does not depend on its own noise, so one wrongly
 /// distrusted is readmitted. Where more than half of a row's values are farther off than noise should be, distances are relative
-/// to theirs: a noise that is stated too small makes no outliers.
+/// to theirs: a noise that is stated too small makes no outliers. A value above 1e100 in size, whose square no sum holds, is left
+/// out.
 ///
 /// @returns the fit; its posterior's observations hold it as scale of their Noise, and report.distrusted lists the values.
 /// @throws  as fit().

@@ -112,14 +112,14 @@
     for (const section of document.querySelectorAll("main section")) {
       byId("sections").append(make("li", {}, make("a", { href: `#${section.id}`, text: section.querySelector("h2").textContent })));
     }
-    byId("colophon").textContent = `Written by gp2 ${report.version}. ${Object.keys(model.units).length ? "Units are labels of the model file." : "The model file states no units: axes are in those of the log."} This file is complete; it loads nothing.`;
+    byId("colophon").textContent = `Written by gp2 ${report.version}. ${Object.keys(model.units).length ? "Units are those of the model file, and those that angles and joints have." : "The model file states no units: axes are in those of the log."} This file is complete; it loads nothing.`;
   }
 
   function fillAdvice() {
     const words = { warning: "To mend", note: "Good to know", good: "All well" };
     byId("advice-list").append(...report.advice.map((one) =>
       make("li", { class: one.level }, make("span", { class: "kind", text: words[one.level] }),
-        make("p", { class: "found", text: one.text }), make("p", { text: one.mend }))));
+        make("p", { class: "found", text: one.text }), one.mend ? make("p", { text: one.mend }) : null)));
   }
 
   function fillModel() {
@@ -201,7 +201,7 @@
     byId("figures").append(table("Figures of quality", [{ label: "figure" }, ...report.data.map((data) => ({ label: data.name, number: true }))], rows));
     byId("figures").append(make("dl", { class: "rows muted" }, ...[
       ["rmse", "root mean square error, in the units of the output" + (report.truth ? "; “truth” compares with the true acceleration, free of noise" : "")],
-      ["rmse / training std", "mean over outputs"], ["nrmse", "rms error over the rms of the spreads of these data"],
+      ["rmse / training std", "mean over outputs"], ["nrmse", "rms error over the rms of the spreads of these data; above 1 their mean predicts better"],
       ["nlpd, coverage", "mean negative log density, and share within the central 50, 80 and 95 %; “with noise” is right for measurements, “without noise” for targets free of noise"],
       ["max |A q̈ − b|", "of the predicted mean, with the parameters of the model file and with the fitted ones"],
     ].flatMap(([label, value]) => [make("dt", { text: label }), make("dd", { text: value })])));
@@ -429,7 +429,7 @@
       const noise = data.noise[k];
       chart(host.children[k], {
         title: output, summary: `rms ${format(rms(values), 3)}${noise === null ? "" : `, fitted noise ${format(noise, 3)}`}`,
-        x, y: { label: `measured − predicted ${output}`, zero: true }, series: [{ label: "residual", values, colour: "--c1", kind: "points" }],
+        x, y: { label: "residual", quantity: output, zero: true }, series: [{ label: "residual", values, colour: "--c1", kind: "points" }],
       });
     });
   }
@@ -889,6 +889,15 @@
     });
   }
 
+  /** Why no fit can be said to be the better one; empty where all are scored on the same test. */
+  function whyNotComparable() {
+    const systems = new Set(reports.map((one) => one.model.coordinates.join(", ")));
+    if (systems.size > 1) return `The fits are of different systems, with the coordinates ${[...systems].join(" and ")}: their figures do not compare.`;
+    const tests = reports.map(judged).map((one) => (one && one.test ? [one.source, one.n, one.outputs, one.figures.n].join() : ""));
+    if (tests.some((one) => one === "" || one !== tests[0])) return "The fits are not scored on the same test data: which one is better these figures do not tell.";
+    return "";
+  }
+
   function compareScores(names) {
     const all = (get) => reports.map((one) => get(one));
     const figure = (get) => all((one) => { const data = judged(one); return data ? get(data.figures) : null; });
@@ -903,8 +912,8 @@
       ["nrmse", figure((e) => e.nrmse), low],
       ["nlpd, with noise", figure((e) => e.nlpd), low],
       ["95 % coverage, with noise", figure((e) => e.coverage95), (values) => values.map((value) => Math.abs(value - 0.95))],
-      ["nlpd, without noise", figure((e) => e.nlpd_latent), low],
-      ["95 % coverage, without noise", figure((e) => e.coverage95_latent), (values) => values.map((value) => Math.abs(value - 0.95))],
+      ["nlpd, without noise", figure((e) => e.nlpd_latent)],
+      ["95 % coverage, without noise", figure((e) => e.coverage95_latent)],
       ["points far from the data", figure((e) => e.n_far)],
       ["max |A q̈ − b|, fitted", figure((e) => e.max_constraint_error_fitted)],
     ];
@@ -916,8 +925,9 @@
     });
     if (off.some((value) => value !== null)) rows.push(["simulated motion, rms error / range", off, low]);
     const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
+    const why = whyNotComparable();
     // the best of a row, where one is better than the others
-    rows.forEach(([, values, cost], r) => {
+    if (!why) rows.forEach(([, values, cost], r) => {
       if (!cost || values.some((value) => value === null)) return;
       const costs = cost(values), least = Math.min(...costs);
       if (costs.filter((one) => one === least).length > 1) return;
@@ -925,7 +935,7 @@
     });
     byId("comparison-scores").append(built);
     const data = [...new Set(reports.map((one) => { const used = judged(one); return used ? `${used.name}: ${used.source}` : "none"; }))];
-    byId("comparison-scores").append(make("p", { class: "muted", text: `Compared on – ${data.join("; ")}. The better of a row is green and bold. Likelihoods compare where the rows learned from are the same.` }));
+    byId("comparison-scores").append(make("p", { class: "muted", text: `Scored on – ${data.join("; ")}. ${why || "The better of a row is green and bold; “without noise” is right only for targets without noise, and not marked."} Likelihoods compare where the rows learned from are the same.` }));
   }
 
   function compareParameters(names) {
