@@ -316,21 +316,24 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
 }
 
 // An angle that turns forth and back by more than half a turn from row to row, as one in degrees does; a wheel turns one way.
-void check_turns(const Coordinate& coordinate, const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& q,
-                 const Eigen::RowVectorXd& dq, std::vector<Finding>& findings) {
+void check_turns(const WholeLog& log, const System& system, int j, std::vector<Finding>& findings) {
   constexpr double often = 0.2;  // of the rows
+  const StateLayout layout = system.layout();
+  const auto t = log.states.row(layout.t()), q = log.states.row(layout.q(j)), dq = log.states.row(layout.dq(j));
   const Eigen::Index n = t.size() - 1;
-  if (n < 1) return;
-  const Eigen::ArrayXd steps = (t.tail(n) - t.head(n)).transpose();
-  if (!(steps > 0).all()) return;  // also where t is not known
-  const Eigen::ArrayXd turned = steps * dq.head(n).transpose().array();
-  const Eigen::Index forth = (turned > std::numbers::pi).count(), back = (turned < -std::numbers::pi).count();
+  Eigen::Index forth = 0, back = 0;
+  for (Eigen::Index i = 0; i < n; ++i) {
+    const double step = t[i + 1] - t[i], turned = step * dq[i];
+    if (!(step > 0)) return;  // also where t is not known
+    forth += turned > std::numbers::pi ? 1 : 0;
+    back += turned < -std::numbers::pi ? 1 : 0;
+  }
   if (forth == 0 || back == 0 || static_cast<double>(forth + back) < often * static_cast<double>(n)) return;
   findings.push_back(
       {Level::warning,
        fmt::format("{} moves by more than half a turn from row to row, forth and back, at {} of {} rows, over a range "
                    "of {:.3g}: is it in rad, and sampled often enough?",
-                   coordinate.name, forth + back, n, q.maxCoeff() - q.minCoeff())});
+                   system.coordinates()[static_cast<std::size_t>(j)].name, forth + back, n, q.maxCoeff() - q.minCoeff())});
 }
 
 // Columns that look clipped, inputs with single values that cannot be, and angles in degrees.
@@ -345,9 +348,9 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
   };
   for (int k = 0; k < layout.nu; ++k) {
     const std::string& name = system.inputs()[static_cast<std::size_t>(k)];
-    const Eigen::RowVectorXd u = log.states.row(layout.u(k));
-    add(Level::good, name, u, "clipped? The log must have what acts");
-    if (std::optional<std::string> far = far_values_text(name, {u})) findings.push_back({Level::warning, *std::move(far)});
+    const std::vector<Eigen::RowVectorXd> u(1, log.states.row(layout.u(k)));
+    add(Level::good, name, u.front(), "clipped? The log must have what acts");
+    if (std::optional<std::string> far = far_values_text(name, u)) findings.push_back({Level::warning, *std::move(far)});
   }
   const std::vector<std::string> accelerations = system.acceleration_names();
   for (int j = 0; j < system.nq(); ++j) {
@@ -357,7 +360,7 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
     const auto q = log.states.row(layout.q(j));
     if (!coordinate.angle) continue;
     if (!is_wrapped_in_degrees({q.begin(), q.end()})) {
-      check_turns(coordinate, log.states.row(layout.t()), q, log.states.row(layout.dq(j)), findings);
+      check_turns(log, system, j, findings);
       continue;
     }
     findings.push_back({Level::error, fmt::format("{} jumps by 360 from row to row: it is in degrees, and an angle is in rad",

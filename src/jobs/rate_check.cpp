@@ -266,26 +266,23 @@ std::optional<PileUp> pile_up(const Ref<const RowVectorXd>& values) {
 std::vector<Index> far_values(const Ref<const RowVectorXd>& values) {
   constexpr double far = 30;
   constexpr Index fewest = 20, one_in = 200;
-  const std::vector<double> measured = measured_entries(values, 0);
-  const Index n = std::ssize(measured);
+  std::vector<double> distances = measured_entries(values, 0);
+  const Index n = std::ssize(distances);
   if (n < fewest) return {};
-  const double middle = median(measured);
-  std::vector<std::pair<double, Index>> distances;  // the farthest first
-  for (Index i = 0; i < values.size(); ++i) {
-    if (!std::isnan(values[i])) distances.emplace_back(std::abs(values[i] - middle), i);
-  }
-  std::ranges::sort(distances, std::greater());
+  const double middle = median(distances);
+  for (double& one : distances) one = std::abs(one - middle);
+  const Index most = std::max<Index>(1, n / one_in);
+  std::partial_sort(distances.begin(), distances.begin() + most + 1, distances.end(), std::greater());
   std::vector<Index> rows;
-  for (Index k = 0; k < std::max<Index>(1, n / one_in); ++k) {
-    const auto at = static_cast<std::size_t>(k);
-    rows.push_back(distances[at].second);
-    const double next = distances[at + 1].first;
-    if (next > 0 && distances[at].first > far * next) {
-      std::ranges::sort(rows);
-      return rows;
+  for (std::size_t k = 0; k < static_cast<std::size_t>(most); ++k) {
+    const double next = distances[k + 1];
+    if (!(next > 0 && distances[k] > far * next)) continue;
+    for (Index i = 0; i < values.size(); ++i) {
+      if (std::abs(values[i] - middle) >= distances[k]) rows.push_back(i);
     }
+    break;
   }
-  return {};
+  return rows;
 }
 
 std::optional<std::string> far_values_text(const std::string& input, const std::vector<RowVectorXd>& logs) {
