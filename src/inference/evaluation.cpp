@@ -372,14 +372,6 @@ std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
   return constraint_residuals(system, states, parameters_of(view, posterior.values().parameters), accelerations, stddev);
 }
 
-std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior, std::size_t group) {
-  const Observations& of = posterior.observations()[group];
-  const VectorXd noise_stddev = posterior.noise_stddev(group);
-  MatrixXd noise(of.view().size(), of.n_data());
-  for (int i = 0; i < of.n_data(); ++i) noise.col(i) = of.noise().at(noise_stddev, i);
-  return constraint_residuals(posterior, of.view().other_system, of.states(), of.view().rows, of.values(), noise);
-}
-
 namespace {
 
 // NaN stays

@@ -115,8 +115,6 @@ struct CrossValidation {
   [[nodiscard]] std::string text() const;
   /// Whether half of the spread of stretches that were left out, or more, is neither predicted nor noise.
   [[nodiscard]] bool predicts_little() const;
-  /// Whether their mean would be the better prediction.
-  [[nodiscard]] bool predicts_nothing() const { return stretches && stretches->nrmse >= 1; }
 };
 
 /// Costs a factorisation and an inverse, with a tenth of that for the stretches.
@@ -135,9 +133,6 @@ std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
                                                      const std::vector<int>& rows,
                                                      const Eigen::Ref<const Eigen::MatrixXd>& measured,
                                                      const Eigen::Ref<const Eigen::MatrixXd>& noise_stddev);
-
-/// The observations of a group, of ddq, against A ddq = b under the fitted parameters and noise.
-std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior, std::size_t group);
 
 /// max |A ddq − b| over states and rows of A.
 /// @param accelerations  (nq × N)
