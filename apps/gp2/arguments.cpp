@@ -1,7 +1,6 @@
 #include <cctype>
 #include <charconv>
 #include <cmath>
-#include <cstdio>
 #include <cstdlib>
 #include <filesystem>
 #include <optional>
@@ -16,6 +15,17 @@
 #include "streams.hpp"
 
 namespace gp2::command {
+
+namespace {
+
+// {"q1", "0.4"} of "q1=0.4"; nothing where there is no =
+std::optional<std::pair<std::string, std::string>> split_at_equals(const std::string& item) {
+  const std::size_t equals = item.find('=');
+  if (equals == std::string::npos) return std::nullopt;
+  return std::pair(item.substr(0, equals), item.substr(equals + 1));
+}
+
+}  // namespace
 
 std::vector<std::string> parse_list(const std::string& text, const std::string& option) {
   std::vector<std::string> items;
@@ -39,15 +49,14 @@ std::vector<std::string> parse_list(const std::string& text, const std::string& 
 std::map<std::string, int> parse_counts(const std::string& text, const std::string& option) {
   std::map<std::string, int> counts;
   for (const std::string& item : parse_list(text, option)) {
-    const std::size_t equals = item.find('=');
+    const auto [name, written] = split_at_equals(item).value_or(std::pair<std::string, std::string>());
     int n = 0;
-    const char* end = item.data() + item.size();
-    const bool is_count = equals != std::string::npos && equals > 0 &&
-                          std::from_chars(item.data() + equals + 1, end, n).ptr == end && equals + 1 < item.size();
-    if (!is_count) throw InputError(fmt::format("{}: '{}' is not RANGE=POINTS, say q1=5", option, item));
-    if (!counts.emplace(item.substr(0, equals), n).second) {
-      throw InputError(fmt::format("{}: '{}' stands twice", option, item.substr(0, equals)));
+    const char* const end = written.data() + written.size();
+    const auto [rest, error] = std::from_chars(written.data(), end, n);
+    if (name.empty() || rest != end || error != std::errc()) {
+      throw InputError(fmt::format("{}: '{}' is not RANGE=POINTS, say q1=5", option, item));
     }
+    if (!counts.emplace(name, n).second) throw InputError(fmt::format("{}: '{}' stands twice", option, name));
   }
   return counts;
 }
@@ -55,27 +64,17 @@ std::map<std::string, int> parse_counts(const std::string& text, const std::stri
 std::map<std::string, std::string> parse_map(const std::string& text) {
   std::map<std::string, std::string> columns;
   for (const std::string& item : parse_list(text, "--map")) {
-    const std::size_t equals = item.find('=');
-    if (equals == std::string::npos || equals == 0 || equals + 1 == item.size()) {
+    const auto [column, name] = split_at_equals(item).value_or(std::pair<std::string, std::string>());
+    if (column.empty() || name.empty()) {
       throw InputError(fmt::format("--map: '{}' is not LOGNAME=MODELNAME, say theta1=q3", item));
     }
-    const std::string name = item.substr(equals + 1);
-    const auto [twice, is_new] = columns.emplace(name, item.substr(0, equals));
-    if (!is_new)
-      throw InputError(
-          fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, item.substr(0, equals)));
+    const auto [twice, is_new] = columns.emplace(name, column);
+    if (!is_new) throw InputError(fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, column));
   }
   return columns;
 }
 
 namespace {
-
-// {"q1", "0.4"} of "q1=0.4"; nothing where there is no =
-std::optional<std::pair<std::string, std::string>> split_at_equals(const std::string& item) {
-  const std::size_t equals = item.find('=');
-  if (equals == std::string::npos) return std::nullopt;
-  return std::pair(item.substr(0, equals), item.substr(equals + 1));
-}
 
 // nothing where it is no finite number
 std::optional<double> finite_number(const std::string& text) {
@@ -148,6 +147,11 @@ void make_folder(const std::string& output) {
   std::error_code error;
   std::filesystem::create_directories(output, error);
   if (error) throw InputError(fmt::format("-o {}: the folder cannot be made: {}", output, error.message()));
+}
+
+bool is_fit(const std::string& text) {
+  const std::size_t first = text.find_first_not_of(" \t\r\n");
+  return first != std::string::npos && text[first] == '{';
 }
 
 std::shared_ptr<const Model> read_other_system(const std::string& path) {

@@ -63,18 +63,15 @@ void run(const CheckArguments& arguments) {
 
 Command check_command() {
   const auto a = std::make_shared<CheckArguments>();
-  Command command{
+  return {
       "check",
       "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns",
       "gp2 check models/double_pendulum.toml --data train.csv",
-      {},
-      {}};
-  command.options = {argument("MODEL", a->model, "model file"),
-                     {"data", &a->data, "CSV", "CSV log", "states of the model's [sampling] or [motion]"}};
-  for (Option& option : options(a->options)) command.options.push_back(std::move(option));
-  command.options.push_back({"json", &a->json, "", "findings as JSON on stdout"});
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+      joined({{argument("MODEL", a->model, "model file"),
+               {"data", &a->data, "CSV", "CSV log", "states of the model's [sampling] or [motion]"}},
+              options(a->options),
+              {{"json", &a->json, "", "findings as JSON on stdout"}}}),
+      [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

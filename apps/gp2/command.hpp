@@ -95,6 +95,8 @@ void require_output(const std::string& output, const std::vector<std::string>& i
 /// @throws InputError when it cannot be made.
 void make_folder(const std::string& output);
 
+/// Whether a text is a file written by gp2 fit: no model file begins so.
+bool is_fit(const std::string& text);
 /// The model of another system; null for an empty path.
 std::shared_ptr<const Model> read_other_system(const std::string& path);
 

@@ -50,40 +50,34 @@ void run(const CompletionArguments& arguments) {
 
 Command completion_command() {
   const auto a = std::make_shared<CompletionArguments>();
-  Command command{
-      "completion",
-      "Print the script that lets a shell complete commands and options, or write those of all shells and the man pages",
-      "source <(gp2 completion bash)\n"
-      "gp2 completion fish > ~/.config/fish/completions/gp2.fish\n"
-      "gp2 completion all -o ~/.local/share",
-      {},
-      {}};
   Option shell{"shell", choice(a->shell, {{"bash", "bash"}, {"zsh", "zsh"}, {"fish", "fish"}, {"all", "all"}}), "",
                "bash, zsh, fish; all: every one of them and the man pages, into the folders below -o"};
   shell.flag = "SHELL";
   Option folder = output(a->output, "DIR", "folder like /usr/local/share or ~/.local/share");
   folder.is_required = false;
-  command.options = {required(std::move(shell)), std::move(folder)};
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"completion",
+          "Print the script that lets a shell complete commands and options, or write those of all shells and the man pages",
+          "source <(gp2 completion bash)\n"
+          "gp2 completion fish > ~/.config/fish/completions/gp2.fish\n"
+          "gp2 completion all -o ~/.local/share",
+          {required(std::move(shell)), std::move(folder)},
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 Command help_command(const std::vector<std::string>& names) {
   const auto name = std::make_shared<std::string>();
-  Command command{"help", "Explain gp2 or one of its commands", "gp2 help fit", {}, {}};
   std::vector<std::pair<std::string, std::string>> words;
   for (const std::string& one : names) words.emplace_back(one, one);
   Option of{"command", choice(*name, words), "", "a command; without it all are listed"};
   of.flag = "COMMAND";
-  command.options = {std::move(of)};
-  command.run = [name](const std::set<std::string>&) {
+  const auto run = [name](const std::set<std::string>&) {
     const std::vector<Command> commands = all_commands();
     for (const Command& one : commands) {
       if (one.name == *name) return write_stdout(help_page(one, help_width()));
     }
     write_stdout(help_page(commands, help_width()));
   };
-  return command;
+  return {"help", "Explain gp2 or one of its commands", "gp2 help fit", {std::move(of)}, run};
 }
 
 }  // namespace gp2::command

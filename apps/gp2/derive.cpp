@@ -105,21 +105,17 @@ void run(DeriveArguments& arguments) {
 
 Command derive_command() {
   const auto a = std::make_shared<DeriveArguments>();
-  Command command{"derive",
-                  "Smooth a raw log of positions into velocities and accelerations for a fit",
-                  "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv",
-                  {},
-                  {}};
-  command.options = {argument("LOG", a->log, "CSV of t and positions, and of velocities and inputs where there are"),
-                     required({"model", &a->model, "MODEL", "model file"}),
-                     {"like", &a->like, "LOG",
-                      "another raw log: smooth this one by the models found for that one, so that what is learned from one and "
-                      "tested on the other has gone through one filter",
-                      "models of its own"}};
-  for (Option& option : options(a->options)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "CSV", "CSV file to write"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"derive", "Smooth a raw log of positions into velocities and accelerations for a fit",
+          "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv",
+          joined({{argument("LOG", a->log, "CSV of t and positions, and of velocities and inputs where there are"),
+                   required({"model", &a->model, "MODEL", "model file"}),
+                   {"like", &a->like, "LOG",
+                    "another raw log: smooth this one by the models found for that one, so that what is learned from one and "
+                    "tested on the other has gone through one filter",
+                    "models of its own"}},
+                  options(a->options),
+                  {output(a->output, "CSV", "CSV file to write")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

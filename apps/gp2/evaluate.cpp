@@ -5,11 +5,11 @@
 #include <utility>
 
 #include <fmt/format.h>
-#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "json.hpp"
 #include "streams.hpp"
 
 namespace gp2::command {
@@ -24,21 +24,19 @@ struct EvaluateArguments {
   bool json = false;
 };
 
-Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
-
 void add_to(Json& json, const Calibration& calibration) {
-  json["coverage50"] = number(calibration.coverage50);
-  json["coverage80"] = number(calibration.coverage80);
-  json["coverage95"] = number(calibration.coverage95);
-  json["coverage50_latent"] = number(calibration.coverage50_latent);
-  json["coverage80_latent"] = number(calibration.coverage80_latent);
-  json["coverage95_latent"] = number(calibration.coverage95_latent);
+  json["coverage50"] = number_or_null(calibration.coverage50);
+  json["coverage80"] = number_or_null(calibration.coverage80);
+  json["coverage95"] = number_or_null(calibration.coverage95);
+  json["coverage50_latent"] = number_or_null(calibration.coverage50_latent);
+  json["coverage80_latent"] = number_or_null(calibration.coverage80_latent);
+  json["coverage95_latent"] = number_or_null(calibration.coverage95_latent);
   json["pit"] = Json::array();
-  for (const double share : calibration.pit) json["pit"].push_back(number(share));
+  for (const double share : calibration.pit) json["pit"].push_back(number_or_null(share));
 }
 
 Json to_json(const Evaluation::Part& part) {
-  Json json = {{"n", part.n}, {"nrmse", number(part.nrmse)}};
+  Json json = {{"n", part.n}, {"nrmse", number_or_null(part.nrmse)}};
   add_to(json, part);
   return json;
 }
@@ -47,12 +45,12 @@ Json to_json(const Evaluation& e) {
   Json rmse = Json::object();
   for (std::size_t k = 0; k < e.outputs.size(); ++k) rmse[e.outputs[k]] = e.rmse[static_cast<Eigen::Index>(k)];
   Json json = {{"rmse", rmse},
-               {"rmse_normalised", number(e.rmse_normalised)},
-               {"nrmse", number(e.nrmse)},
+               {"rmse_normalised", number_or_null(e.rmse_normalised)},
+               {"nrmse", number_or_null(e.nrmse)},
                {"max_constraint_error", e.max_constraint_error},
                {"max_constraint_error_fitted", e.max_constraint_error_fitted},
-               {"nlpd", number(e.nlpd)},
-               {"nlpd_latent", number(e.nlpd_latent)}};
+               {"nlpd", number_or_null(e.nlpd)},
+               {"nlpd_latent", number_or_null(e.nlpd_latent)}};
   add_to(json, e);
   json["n_zero_variance"] = e.n_zero_variance;
   json["near"] = to_json(e.near);
@@ -113,18 +111,14 @@ void run(EvaluateArguments& arguments) {
 
 Command evaluate_command() {
   const auto a = std::make_shared<EvaluateArguments>();
-  Command command{"evaluate",
-                  "Compare predictions of the constrained acceleration with measured or true values",
-                  "gp2 evaluate fit.json --data test.csv --json",
-                  {},
-                  {}};
-  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
-                     required({"data", &a->data, "CSV", "CSV with states and accelerations"}),
-                     {"system", &a->system, "OTHER.toml", system_help}};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back({"json", &a->json, "", "figures as JSON on stdout"});
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"evaluate", "Compare predictions of the constrained acceleration with measured or true values",
+          "gp2 evaluate fit.json --data test.csv --json",
+          joined({{argument("FIT.json", a->fit, "file written by gp2 fit"),
+                   required({"data", &a->data, "CSV", "CSV with states and accelerations"}),
+                   {"system", &a->system, "OTHER.toml", system_help}},
+                  options(a->request),
+                  {{"json", &a->json, "", "figures as JSON on stdout"}}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

@@ -4,12 +4,12 @@
 #include <memory>
 
 #include <fmt/format.h>
-#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "interruption.hpp"
+#include "json.hpp"
 #include "streams.hpp"
 
 namespace gp2::command {
@@ -24,12 +24,10 @@ struct ExciteArguments {
   bool json = false;
 };
 
-Json finite_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
-
 Json to_json(const std::vector<Excitation::Known>& known) {
   Json list = Json::array();
   for (const Excitation::Known& one : known) {
-    list.push_back({{"name", one.name}, {"now", one.now}, {"after", one.after}, {"random", finite_or_null(one.random)}});
+    list.push_back({{"name", one.name}, {"now", one.now}, {"after", one.after}, {"random", number_or_null(one.random)}});
   }
   return list;
 }
@@ -46,7 +44,7 @@ Json to_json(const Excitation& found) {
   }
   return {{"for", found.target == ExcitationTarget::parameters ? "parameters" : "accelerations"},
           {"factor", found.factor},
-          {"random_factor", finite_or_null(found.random_factor)},
+          {"random_factor", number_or_null(found.random_factor)},
           {"parameters", to_json(found.parameters)},
           {"accelerations", to_json(found.accelerations)},
           {"limits", limits},
@@ -135,26 +133,21 @@ void run(ExciteArguments& arguments) {
 
 Command excite_command() {
   const auto a = std::make_shared<ExciteArguments>();
-  Command command{"excite",
-                  "Find the motion, within limits, that measuring will tell most of what is not known",
-                  "gp2 excite fit.json --start q1=0,q2=0 --duration 10 --inputs-within u1=-5:5,u2=-5:5,u3=-5:5 -o next.csv",
-                  {},
-                  {}};
-  command.options = {
-      argument("FIT", a->fit, "file written by gp2 fit"),
-      {"system", &a->system, "OTHER.toml", system_help},
-      start_option(a->start),
-      required({"duration", &a->request.duration, "SECONDS", "of the motion [s]"}),
-      required({"inputs_within", &a->inputs_within, "NAME=LOWEST:HIGHEST,…", "limits of every input, which it never leaves"}),
-      {"within", &a->within, "NAME=LOWEST:HIGHEST,…",
-       "limits of coordinates, velocities and accelerations, kept at every row as the fit predicts the motion"},
-  };
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back({"json", &a->json, "", "report on stdout as JSON"});
-  command.options.push_back(
-      output(a->output, "CSV", "CSV file to write: t, the planned q, dq and ddq, and the inputs, for gp2 simulate too"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"excite", "Find the motion, within limits, that measuring will tell most of what is not known",
+          "gp2 excite fit.json --start q1=0,q2=0 --duration 10 --inputs-within u1=-5:5,u2=-5:5,u3=-5:5 -o next.csv",
+          joined({{argument("FIT", a->fit, "file written by gp2 fit"),
+                   {"system", &a->system, "OTHER.toml", system_help},
+                   start_option(a->start),
+                   required({"duration", &a->request.duration, "SECONDS", "of the motion [s]"}),
+                   required({"inputs_within", &a->inputs_within, "NAME=LOWEST:HIGHEST,…",
+                             "limits of every input, which it never leaves"}),
+                   {"within", &a->within, "NAME=LOWEST:HIGHEST,…",
+                    "limits of coordinates, velocities and accelerations, kept at every row as the fit predicts the motion"}},
+                  options(a->request),
+                  {{"json", &a->json, "", "report on stdout as JSON"},
+                   output(a->output, "CSV",
+                          "CSV file to write: t, the planned q, dq and ddq, and the inputs, for gp2 simulate too")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

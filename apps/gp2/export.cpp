@@ -6,7 +6,6 @@
 
 #include "command.hpp"
 #include "gp2/base/file.hpp"
-#include "gp2/error.hpp"
 #include "gp2/jobs/export_job.hpp"
 
 namespace gp2::command {
@@ -47,19 +46,15 @@ void run(ExportArguments& arguments) {
 
 Command export_command() {
   const auto a = std::make_shared<ExportArguments>();
-  Command command{
+  return {
       "export",
       "Write a fit as C: predictions that obey the constraints on machines without gp2, in CasADi and in acados; or the "
       "parameters of a robot into its own file",
       "gp2 export fit.json --to c -o controller",
-      {},
-      {}};
-  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"), {"system", &a->system, "OTHER.toml", system_help}};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(
-      output(a->output, "OUT", "folder for the files, which is made where there is none; of mjcf and urdf the file"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+      joined({{argument("FIT.json", a->fit, "file written by gp2 fit"), {"system", &a->system, "OTHER.toml", system_help}},
+              options(a->request),
+              {output(a->output, "OUT", "folder for the files, which is made where there is none; of mjcf and urdf the file")}}),
+      [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

@@ -1,13 +1,9 @@
 #include <algorithm>
 #include <cmath>
-#include <cstdio>
-#include <cstring>
-#include <limits>
 #include <memory>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
@@ -17,6 +13,7 @@
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
+#include "json.hpp"
 #include "ranks.hpp"
 #include "streams.hpp"
 
@@ -65,8 +62,6 @@ void say_how_far(const Progress& p) {
   const std::string best = std::isfinite(p.best) ? fmt::format("{:.4f}", p.best) : "none yet";
   print_progress(fmt::format("{}{}  best {}  about {:.0f} s left", rows, place, best, left));
 }
-
-Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
 Json draws_json(const FitReport& report) {
   const HyperparameterDraws& draws = *report.draws;
@@ -150,9 +145,11 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
                                  {"at_bound", one.at_lower() || one.at_upper()}});
   }
   if (outcome.cross_validation) {
-    json["left_out"]["one_by_one"] = to_json(outcome.cross_validation->one_by_one);
-    const std::optional<Evaluation::Part>& stretches = outcome.cross_validation->stretches;
-    json["left_out"]["stretches"] = stretches ? to_json(*stretches) : Json();
+    const auto scores = [](const LeftOutScores& of) {
+      return Json{{"one_by_one", to_json(of.one_by_one)}, {"stretches", of.stretches ? to_json(*of.stretches) : Json()}};
+    };
+    json["left_out"] = scores(*outcome.cross_validation);
+    for (const LeftOutScores& other : outcome.cross_validation->other_views) json["left_out"]["also"][other.view] = scores(other);
   }
   if (!problem.robust) return json;
   json["distrusted"] = Json::array();
@@ -334,13 +331,10 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
 
 Command fit_command() {
   const auto a = std::make_shared<FitArguments>();
-  Command command{"fit",
-                  "Fit a model to a log of states and accelerations",
-                  "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json",
-                  {},
-                  {}};
-  const std::vector<Option> inputs = {
-      argument("MODEL", a->model, "model file"),
+  Option model = argument("MODEL", a->model, "model file");
+  model.is_required = false;  // --again stands for it
+  std::vector<Option> inputs = {
+      std::move(model),
       {"data", Repeated{&a->data}, "LOG[@OTHER.toml]",
        "CSV log; columns are found by name, in any order. Several: --data A.csv --data B.csv@OTHER.toml, where B was measured on "
        "the system of another model file"},
@@ -353,16 +347,15 @@ Command fit_command() {
        "instead of --data: CSV log of t and positions, which learning and smoothing by turns makes data of (docs/raw-logs.md)"},
       {"smoothed", &a->smoothed, "CSV", "file to write q, dq and ddq of the raw log to, with deviations", "", "", "", "raw"},
   };
-  command.options =
-      joined({in_group("Data", inputs),
-              options(a->request, a->raw_options),
-              {{"again", &a->again, "FIT.json",
-                "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
-               {"json", &a->json, "", "report as JSON on stdout"},
-               output(a->output, "FIT.json", "fitted model to write (JSON)")}});
-  command.options.front().is_required = false;  // --again stands for it
-  command.run = [a](const std::set<std::string>& given) { run(*a, given); };
-  return command;
+  return {"fit", "Fit a model to a log of states and accelerations",
+          "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json",
+          joined({in_group("Data", std::move(inputs)),
+                  options(a->request, a->raw_options),
+                  {{"again", &a->again, "FIT.json",
+                    "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
+                   {"json", &a->json, "", "report as JSON on stdout"},
+                   output(a->output, "FIT.json", "fitted model to write (JSON)")}}),
+          [a](const std::set<std::string>& given) { run(*a, given); }};
 }
 
 }  // namespace gp2::command

@@ -31,16 +31,11 @@ void run(const GenerateArguments& arguments) {
 
 Command generate_command() {
   const auto a = std::make_shared<GenerateArguments>();
-  Command command{"generate",
-                  "Draw states from a model's [sampling] and measure its [truth]",
-                  "gp2 generate models/surface.toml --n 100 --seed 1 -o train.csv",
-                  {},
-                  {}};
-  command.options = {argument("MODEL", a->model, "model file")};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "CSV", "CSV file to write"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {
+      "generate", "Draw states from a model's [sampling] and measure its [truth]",
+      "gp2 generate models/surface.toml --n 100 --seed 1 -o train.csv",
+      joined({{argument("MODEL", a->model, "model file")}, options(a->request), {output(a->output, "CSV", "CSV file to write")}}),
+      [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

@@ -1,8 +1,6 @@
 #include "pages.hpp"
 
 #include <algorithm>
-#include <functional>
-#include <optional>
 #include <utility>
 #include <variant>
 

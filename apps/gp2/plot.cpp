@@ -31,16 +31,12 @@ void run(const PlotArguments& arguments) {
 
 Command plot_command() {
   const auto a = std::make_shared<PlotArguments>();
-  Command command{"plot",
-                  "Draw what a fit has learned: one force along one variable, with its 95 % band and where the data are",
-                  "gp2 plot fit.json --what friction -o friction.svg",
-                  {},
-                  {}};
-  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit")};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "SVG", "SVG file to write; it needs no network"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"plot", "Draw what a fit has learned: one force along one variable, with its 95 % band and where the data are",
+          "gp2 plot fit.json --what friction -o friction.svg",
+          joined({{argument("FIT.json", a->fit, "file written by gp2 fit")},
+                  options(a->request),
+                  {output(a->output, "SVG", "SVG file to write; it needs no network")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

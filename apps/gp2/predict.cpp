@@ -1,5 +1,4 @@
 #include <algorithm>
-#include <cstdint>
 #include <memory>
 #include <optional>
 #include <utility>
@@ -83,18 +82,14 @@ void run(PredictArguments& arguments) {
 
 Command predict_command() {
   const auto a = std::make_shared<PredictArguments>();
-  Command command{"predict",
-                  "Predict accelerations at given states, with their uncertainty",
-                  "gp2 predict fit.json --states states.csv --cov std -o prediction.csv",
-                  {},
-                  {}};
-  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
-                     required({"states", &a->states, "CSV", "CSV with the states; one output row per input row"}),
-                     {"system", &a->system, "OTHER.toml", system_help}};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "CSV", "CSV file to write"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"predict", "Predict accelerations at given states, with their uncertainty",
+          "gp2 predict fit.json --states states.csv --cov std -o prediction.csv",
+          joined({{argument("FIT.json", a->fit, "file written by gp2 fit"),
+                   required({"states", &a->states, "CSV", "CSV with the states; one output row per input row"}),
+                   {"system", &a->system, "OTHER.toml", system_help}},
+                  options(a->request),
+                  {output(a->output, "CSV", "CSV file to write")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

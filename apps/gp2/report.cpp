@@ -36,18 +36,14 @@ void run(const ReportArguments& arguments) {
 
 Command report_command() {
   const auto a = std::make_shared<ReportArguments>();
-  Command command{
-      "report",
-      "Write a fit as one HTML page: what was fitted, how well, pictures of residuals, calibration and motion, and what "
-      "to do next",
-      "gp2 report fit.json --data test.csv -o report.html",
-      {},
-      {}};
-  command.options = {arguments("FIT.json", a->options.fits, "file written by gp2 fit; several stand side by side on the page")};
-  for (Option& option : options(a->options)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "HTML", "HTML file to write; it needs no network"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"report",
+          "Write a fit as one HTML page: what was fitted, how well, pictures of residuals, calibration and motion, and what "
+          "to do next",
+          "gp2 report fit.json --data test.csv -o report.html",
+          joined({{arguments("FIT.json", a->options.fits, "file written by gp2 fit; several stand side by side on the page")},
+                  options(a->options),
+                  {output(a->output, "HTML", "HTML file to write; it needs no network")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

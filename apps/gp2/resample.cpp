@@ -27,24 +27,24 @@ void run(const ResampleArguments& arguments) {
   print_notes({fmt::format("measured by {}, each in its standard deviations", fmt::join(chosen.features, ", ")),
                fmt::format("{}: {} of {} rows; every other row is within {:.3g} of one of them", arguments.output,
                            chosen.rows.size(), log.n_rows(), chosen.radius)});
+  const auto n_repeating = (chosen.distance.array() == 0).count() - 1;  // the first has none before it
+  if (n_repeating > 0)
+    print_notes(
+        {fmt::format("the last {} rows repeat those before them in every feature: fewer cover the log as well", n_repeating)});
 }
 
 }  // namespace
 
 Command resample_command() {
   const auto a = std::make_shared<ResampleArguments>();
-  Command command{"resample",
-                  "Choose the rows of a log that cover its states best: farthest points in the model's features",
-                  "gp2 resample log.csv --model models/surface.toml -n 50 -o subset.csv",
-                  {},
-                  {}};
   Option n = required({"n", &a->options.n, "N", "number of rows"});
   n.flag = "-n,--n";
-  command.options = {argument("LOG", a->log, "CSV log"), required({"model", &a->model, "MODEL", "model file"}), std::move(n)};
-  for (Option& option : options(a->options)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "CSV", "CSV file to write: whole rows in the order of choice"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"resample", "Choose the rows of a log that cover its states best: farthest points in the model's features",
+          "gp2 resample log.csv --model models/surface.toml -n 50 -o subset.csv",
+          joined({{argument("LOG", a->log, "CSV log"), required({"model", &a->model, "MODEL", "model file"}), std::move(n)},
+                  options(a->options),
+                  {output(a->output, "CSV", "CSV file to write: whole rows in the order of choice")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

@@ -45,18 +45,14 @@ void run(const ShootArguments& arguments) {
 
 Command shoot_command() {
   const auto a = std::make_shared<ShootArguments>();
-  Command command{"shoot",
-                  "Estimate the parameters of a fit anew from the motion over stretches of a log (multiple shooting)",
-                  "gp2 shoot fit.json --data smoothed.csv -o shot.json",
-                  {},
-                  {}};
-  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit, with parameters that it estimates"),
-                     required({"data", &a->data, "CSV",
-                               "consecutive rows of t, coordinates, velocities and inputs, as gp2 derive writes them"})};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "JSON", "the fit with these parameters"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"shoot", "Estimate the parameters of a fit anew from the motion over stretches of a log (multiple shooting)",
+          "gp2 shoot fit.json --data smoothed.csv -o shot.json",
+          joined({{argument("FIT.json", a->fit, "file written by gp2 fit, with parameters that it estimates"),
+                   required({"data", &a->data, "CSV",
+                             "consecutive rows of t, coordinates, velocities and inputs, as gp2 derive writes them"})},
+                  options(a->request),
+                  {output(a->output, "JSON", "the fit with these parameters")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

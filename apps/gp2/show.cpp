@@ -20,21 +20,14 @@ struct ShowArguments {
 
 Command show_command() {
   const auto a = std::make_shared<ShowArguments>();
-  Command command{"show",
-                  "Print the derived A, b, M, F, the parameters and the features of a model, and what a fit has found",
-                  "gp2 show models/surface.toml",
-                  {},
-                  {}};
-  command.options = options(a->request);
-  command.options.insert(command.options.begin(), argument("FILE", a->file, "model file, or file written by gp2 fit"));
-  command.run = [a](const std::set<std::string>&) {
-    const std::string text = read_file(a->file);
-    const std::size_t first = text.find_first_not_of(" \t\r\n");
-    const bool is_fit = first != std::string::npos && text[first] == '{';  // no model file begins so
-    print_result("{}", is_fit ? show(FitFile::parse(text, a->file), a->request, with_flags)
-                              : show(Model::parse(text, a->file), a->request));
-  };
-  return command;
+  return {"show", "Print the derived A, b, M, F, the parameters and the features of a model, and what a fit has found",
+          "gp2 show models/surface.toml",
+          joined({{argument("FILE", a->file, "model file, or file written by gp2 fit")}, options(a->request)}),
+          [a](const std::set<std::string>&) {
+            const std::string text = read_file(a->file);
+            print_result("{}", is_fit(text) ? show(FitFile::parse(text, a->file), a->request, with_flags)
+                                            : show(Model::parse(text, a->file), a->request));
+          }};
 }
 
 }  // namespace gp2::command

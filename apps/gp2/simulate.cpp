@@ -38,8 +38,7 @@ struct Subject {
 
 Subject read_subject(const SimulateArguments& arguments) {
   std::string text = read_file(arguments.file);
-  const std::size_t first = text.find_first_not_of(" \t\r\n");
-  if (first == std::string::npos || text[first] != '{') {
+  if (!is_fit(text)) {
     if (!arguments.system.empty()) {
       throw InputError(
           fmt::format("--system goes with a FIT.json; {} is a model: simulate {} itself", arguments.file, arguments.system));
@@ -276,25 +275,18 @@ void run(const SimulateArguments& arguments) {
 
 Command simulate_command() {
   const auto a = std::make_shared<SimulateArguments>();
-  Command command{"simulate",
-                  "Integrate the motion of a fit or of a model, on its constraints",
-                  "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv",
-                  {},
-                  {}};
-  command.options = {
-      argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
-      {"system", &a->system, "OTHER.toml", system_help},
-      start_option(a->start),
-      required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
-      {"t_start", &a->t_start, "SECONDS", "its start [s]", "t of the CSV of --start, or 0"},
-      {"dt", &a->time_step, "SECONDS", "time between written rows; the end is always written [s]", "100 rows"},
-      {"inputs", &a->inputs, "CSV", "CSV with t and every input, linear in between; must cover the motion", "zero"},
-  };
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back({"json", &a->json, "", "report on stdout as JSON"});
-  command.options.push_back(output(a->output, "CSV", "CSV file to write"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"simulate", "Integrate the motion of a fit or of a model, on its constraints",
+          "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv",
+          joined({{argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
+                   {"system", &a->system, "OTHER.toml", system_help},
+                   start_option(a->start),
+                   required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
+                   {"t_start", &a->t_start, "SECONDS", "its start [s]", "t of the CSV of --start, or 0"},
+                   {"dt", &a->time_step, "SECONDS", "time between written rows; the end is always written [s]", "100 rows"},
+                   {"inputs", &a->inputs, "CSV", "CSV with t and every input, linear in between; must cover the motion", "zero"}},
+                  options(a->request),
+                  {{"json", &a->json, "", "report on stdout as JSON"}, output(a->output, "CSV", "CSV file to write")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

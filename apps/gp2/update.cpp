@@ -36,17 +36,13 @@ void run(const UpdateArguments& arguments) {
 
 Command update_command() {
   const auto a = std::make_shared<UpdateArguments>();
-  Command command{"update",
-                  "Add more data to a fit, its hyperparameters held: what a machine logs while it runs",
-                  "gp2 update fit.json --data today.csv -o fit.json",
-                  {},
-                  {}};
-  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
-                     required({"data", Repeated{&a->data}, "CSV", "log to add; several may be given"})};
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "JSON", "the fit with these data; may be FIT.json itself"));
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {"update", "Add more data to a fit, its hyperparameters held: what a machine logs while it runs",
+          "gp2 update fit.json --data today.csv -o fit.json",
+          joined({{argument("FIT.json", a->fit, "file written by gp2 fit"),
+                   required({"data", Repeated{&a->data}, "CSV", "log to add; several may be given"})},
+                  options(a->request),
+                  {output(a->output, "JSON", "the fit with these data; may be FIT.json itself")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

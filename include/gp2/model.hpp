@@ -46,18 +46,14 @@ struct ModelCode {
 /// code instead; everything else is the same then.
 class Model {
  public:
-  /// @throws InputError with file, line, key, the rule, the value got and the mend.
-  static Model read(const std::filesystem::path& path);
+  /// @param code  what the file leaves to it: M, A, b and F, when it is without [mechanics] and [constraints]; features and
+  ///   directions of latents, when it has { code = [names] } in their place
+  /// @throws InputError with file, line, key, the rule, the value got and the mend; also when code and file both give something,
+  ///   or neither, and when the mechanics return nothing, or a system that goes by other coordinates, inputs or parameters.
+  static Model read(const std::filesystem::path& path, const ModelCode& code = {});
   /// @param name  stands for the file in messages; its folder is where a relative robot = "FILE" is looked for
-  static Model parse(std::string text, std::string name);
+  static Model parse(std::string text, std::string name, const ModelCode& code = {});
   static Model parse(std::string text, std::string name, const RobotSource& robot, const ModelCode& code = {});
-
-  /// The same of a file that leaves something to code: M, A, b and F, when it is without [mechanics] and [constraints]; features
-  /// and directions of latents, when it has { code = [names] } in their place.
-  /// @throws InputError also when code and file both give something, or neither; and when the mechanics return nothing, or a
-  ///   system that goes by other coordinates, inputs or parameters.
-  static Model read(const std::filesystem::path& path, const ModelCode& code);
-  static Model parse(std::string text, std::string name, const ModelCode& code);
 
   /// A model without a file: its text declares what a fit on disk must hold, the rest is code, as for `parse`.
   /// @throws InputError as make_prior.

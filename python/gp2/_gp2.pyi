@@ -236,11 +236,17 @@ class EvaluationPart(Calibration):
     @property
     def nrmse(self) -> float: ...
 
-class CrossValidation:
+class LeftOutScores:
+    @property
+    def view(self) -> str: ...
     @property
     def one_by_one(self) -> EvaluationPart: ...
     @property
     def stretches(self) -> EvaluationPart | None: ...
+
+class CrossValidation(LeftOutScores):
+    @property
+    def other_views(self) -> list[LeftOutScores]: ...
 
 class Evaluation(Calibration):
     @property

@@ -77,8 +77,8 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   const FitSystem asked = system_of(self.file, posterior.prior(), model_of(system));
   const SimulateJob job = unlocked([&] { return prepare_simulation(asked, posterior, request); });
   std::vector<SimulatedMotion> motions = run_motions(job);
-  if (!request.n_samples) {
-    motions[0].uncertainty = unlocked([&] { return motion_uncertainty(posterior, motions[0].trajectory, asked.other_system); });
+  for (SimulatedMotion& motion : motions) {
+    motion.uncertainty = unlocked([&] { return motion_uncertainty(posterior, motion.trajectory, asked.other_system); });
   }
   tell(motion_notes(motions));
   std::vector<Motion> out;
@@ -183,14 +183,14 @@ void add_motion(py::module_& module) {
             if (!m.uncertainty) return py::none();
             return to_rows(m.uncertainty->stddev);
           },
-          "Of ddq along the mean's motion (n, nq); None of a model's own motion or a sample's.")
+          "Of ddq along the motion, as the posterior has it (n, nq); None of a model's own motion.")
       .def_property_readonly(
           "distance_from_data",
           [](const Motion& m) -> py::object {
             if (!m.uncertainty) return py::none();
             return to_vector(m.uncertainty->distance);
           },
-          "As of Prediction, along the mean's motion (n); None as std.")
+          "As of Prediction, along the motion (n); None as std.")
       .def_property_readonly(
           "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
       .def_property_readonly(

@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <filesystem>
 #include <thread>
@@ -112,7 +113,16 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
     });
     if (PyErr_CheckSignals() != 0) throw py::error_already_set();
   }
-  out.distance_from_data = to_vector(unlocked([&] { return posterior.distance_from_data(view, x, n_threads); }));
+  VectorXd distance = unlocked([&] { return posterior.distance_from_data(view, x, n_threads); });
+  // arrays may be single states of a loop, which is not to be slowed down
+  if (!mean_only && !is_array(data)) {
+    for (const auto& note : unlocked([&] {
+           return std::array{note_of_distance(distance), note_of_untold(posterior, asked.at, x, mean, distance)};
+         })) {
+      if (note) tell({*note});
+    }
+  }
+  out.distance_from_data = to_vector(std::move(distance));
   out.names = asked.at.names;
   out.mean = to_rows(std::move(mean));
   if (!mean_only) {
@@ -349,12 +359,16 @@ void add_evaluation(py::module_& module) {
   py::class_<Evaluation::Part, Calibration>(module, "EvaluationPart", "Figures of some of the points.")
       .def_readonly("n", &Evaluation::Part::n, "Of these points.")
       .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.");
-  py::class_<CrossValidation>(module, "CrossValidation", "Scores of the data of a fit, where it has not seen them.")
-      .def_readonly("one_by_one", &CrossValidation::one_by_one, "Each value from all others.")
+  py::class_<LeftOutScores>(module, "LeftOutScores", "Scores of the data of one view, where the fit has not seen them.")
+      .def_readonly("view", &LeftOutScores::view, "Such as multipliers; empty: the accelerations.")
+      .def_readonly("one_by_one", &LeftOutScores::one_by_one, "Each row from all others.")
       .def_readonly(
-          "stretches", &CrossValidation::stretches,
+          "stretches", &LeftOutScores::stretches,
           "Each of five stretches of time from the rest: what a motion elsewhere would meet. None where the rows are in "
-          "no order of time.")
+          "no order of time.");
+  py::class_<CrossValidation, LeftOutScores>(module, "CrossValidation",
+                                             "Scores of the data of a fit, where it has not seen them.")
+      .def_readonly("other_views", &CrossValidation::other_views, "Of data of other views, as of forces.")
       .def("__repr__", [](const CrossValidation& c) { return fmt::format("<gp2.CrossValidation: {}>", c.text()); });
   py::class_<Evaluation, Calibration>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
       .def_readonly("outputs", &Evaluation::outputs, "Names of the accelerations.")
@@ -446,7 +460,8 @@ system     another System with the same coordinates, inputs and latents: under i
 latent     only what this latent adds, by its name
 mean_only  leaves out std and cov, which cost more by two orders
 
-Returns a Prediction with mean (n, d), std (n, d), cov (n, d, d).
+Returns a Prediction with mean (n, d), std (n, d), cov (n, d, d). Of a table, the logger 'gp2' tells where deviations are too small, as
+gp2 predict does; arrays of states, which a loop may hand over one by one, are predicted and no more.
 Raises InputError for states that are not finite where they are read, or contradict the constraints.)");
 }
 
@@ -512,7 +527,7 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
       .def(
           "cross_validate", [](const PyPosterior& self) { return cross_validate(self.file, self.posterior); },
           py::call_guard<py::gil_scoped_release>(),
-          "How well the data predict themselves: each value from all others, and each of five stretches of time from the rest.")
+          "How well the data predict themselves: each row from all others, and each of five stretches of time from the rest.")
       .def(
           "fewest_components",
           [](const PyPosterior& self, double largest_error, const std::string& view, const PySystem* system,

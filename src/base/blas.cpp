@@ -75,8 +75,7 @@ BlasReport blas_report() {
   if (!report.fastest_kernel.empty()) {
     report.advice = fmt::format(
         "start the program with OPENBLAS_CORETYPE={} in its environment: the processor has {}, which the kernel in use, {}, "
-        "leaves "
-        "idle",
+        "leaves idle",
         report.fastest_kernel, features.avx512 ? "AVX-512" : "AVX2", report.kernel);
   }
   return report;

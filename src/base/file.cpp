@@ -24,13 +24,6 @@
 
 namespace gp2 {
 
-namespace {
-
-constexpr int patience = 3000;                                 // how long a pipe may lack a writer [ms]
-constexpr std::size_t max_device_size = std::size_t{1} << 24;  // /dev/zero has no end; a person at a terminal types less
-
-}  // namespace
-
 class OpenFile {
  public:
   explicit OpenFile(const std::filesystem::path& path) : descriptor(open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK)) {}
@@ -51,40 +44,13 @@ class OpenFile {
 
 namespace {
 
-// What a file is that begins so, and the mend, where it is one of those that are taken for text by mistake.
-std::optional<std::string> other_than_text(std::string_view begin) {
-  using namespace std::string_view_literals;
-  if (begin.starts_with("\xff\xfe"sv) || begin.starts_with("\xfe\xff"sv)) {
-    return "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)";
-  }
-  if (begin.starts_with("\x1f\x8b"sv)) return "the file is compressed by gzip; unpack it first (gunzip)";
-  if (begin.starts_with("PK\x03\x04"sv)) return "the file is a ZIP archive, as spreadsheets are; export it as CSV, or unpack it";
-  return std::nullopt;
-}
-
-}  // namespace
-
-namespace {
+constexpr int patience = 3000;                                 // how long a pipe may lack a writer [ms]
+constexpr std::size_t max_device_size = std::size_t{1} << 24;  // /dev/zero has no end; a person at a terminal types less
 
 FileVersion version_of(const struct stat& status) {
   return {status.st_dev, status.st_ino, static_cast<std::uint64_t>(status.st_size), status.st_mtim.tv_sec,
           status.st_mtim.tv_nsec};
 }
-
-}  // namespace
-
-void throw_changed(const std::filesystem::path& path) {
-  throw InputError(
-      fmt::format("{}: changed while it was read; read it when nothing writes to it any more, or read a copy", path.string()));
-}
-
-std::optional<FileVersion> file_version(const std::filesystem::path& path) {
-  struct stat status = {};
-  if (stat(path.c_str(), &status) != 0 || !S_ISREG(status.st_mode)) return std::nullopt;
-  return version_of(status);
-}
-
-namespace {
 
 [[noreturn]] void refuse(const std::filesystem::path& path, const std::string& why) {
   throw InputError(fmt::format("{}: {}", path.string(), why));
@@ -106,8 +72,16 @@ void require_size(std::uint64_t size, const std::filesystem::path& path, std::si
   if (size > max_size) refuse(path, fmt::format("{} bytes; at most {} are read", size, max_size));
 }
 
+// Not one of the files that are taken for text by mistake.
 void require_text(std::string_view begin, const std::filesystem::path& path) {
-  if (const std::optional<std::string> kind = other_than_text(begin)) refuse(path, *kind);
+  using namespace std::string_view_literals;
+  if (begin.starts_with("\xff\xfe"sv) || begin.starts_with("\xfe\xff"sv)) {
+    refuse(path, "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)");
+  }
+  if (begin.starts_with("\x1f\x8b"sv)) refuse(path, "the file is compressed by gzip; unpack it first (gunzip)");
+  if (begin.starts_with("PK\x03\x04"sv)) {
+    refuse(path, "the file is a ZIP archive, as spreadsheets are; export it as CSV, or unpack it");
+  }
 }
 
 // Reads what a descriptor that does not wait has, block after block, to its end.
@@ -124,11 +98,8 @@ void read_to_end(const OpenFile& file, bool is_pipe, const std::filesystem::path
       if (has_writer) return;
       // no one has opened the pipe for writing yet
       if (was_patient) refuse(path, "cannot be read: a pipe that nothing writes to");
-      if (file.wait(patience)) {
-        has_writer = true;
-      } else {
-        was_patient = true;
-      }
+      has_writer = file.wait(patience);
+      was_patient = !has_writer;
     } else if (errno == EAGAIN) {
       has_writer = true;
       static_cast<void>(file.wait(-1));
@@ -139,6 +110,17 @@ void read_to_end(const OpenFile& file, bool is_pipe, const std::filesystem::path
 }
 
 }  // namespace
+
+void throw_changed(const std::filesystem::path& path) {
+  throw InputError(
+      fmt::format("{}: changed while it was read; read it when nothing writes to it any more, or read a copy", path.string()));
+}
+
+std::optional<FileVersion> file_version(const std::filesystem::path& path) {
+  struct stat status = {};
+  if (stat(path.c_str(), &status) != 0 || !S_ISREG(status.st_mode)) return std::nullopt;
+  return version_of(status);
+}
 
 FileParts::FileParts(std::filesystem::path path)
     : path_(std::move(path)), file_(std::make_unique<const OpenFile>(path_)), version_(version_of(status_of(*file_, path_))) {

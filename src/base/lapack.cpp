@@ -72,6 +72,11 @@ struct Block {
   }
 };
 
+// Of what is const it is only read: Block is one type for both.
+Block block_of(const Eigen::Ref<const Eigen::MatrixXd>& A) {
+  return {const_cast<double*>(A.data()), static_cast<int>(A.outerStride())};  // NOLINT(cppcoreguidelines-pro-type-const-cast)
+}
+
 // Calls work(first, how many) for pieces of n rows or columns, each of which takes so many operations; false when stopped.
 template <typename Work>
 bool in_pieces(int n, double per_row, const Pieces& pieces, const Work& work) {
@@ -127,7 +132,7 @@ bool factorise(int n, Block A, const Pieces& pieces) {
 
 bool factorise(Eigen::Ref<Eigen::MatrixXd> A, const Pieces& pieces) {
   const BufferInUse buffer;
-  return factorise(static_cast<int>(A.rows()), {A.data(), static_cast<int>(A.outerStride())}, pieces);
+  return factorise(static_cast<int>(A.rows()), block_of(A), pieces);
 }
 
 PivotedFactor factorise_semidefinite(Eigen::MatrixXd A, std::optional<double> smallest) {
@@ -209,8 +214,7 @@ bool square_triangle(int n, Block X, const Pieces& pieces) {
 void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces) {
   const BufferInUse buffer;
   const int n = static_cast<int>(L.rows());
-  const Block block{L.data(), static_cast<int>(L.outerStride())};
-  if (n > 0 && invert_triangle(n, block, pieces)) square_triangle(n, block, pieces);
+  if (n > 0 && invert_triangle(n, block_of(L), pieces)) square_triangle(n, block_of(L), pieces);
 }
 
 namespace {
@@ -252,20 +256,13 @@ void solve_lower(int n, Block L, bool transposed, int n_columns, Block B) {
 
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B) {
   const BufferInUse buffer;
-  const int n = static_cast<int>(L.rows());
-  const int n_columns = static_cast<int>(B.cols());
-  const int lda = static_cast<int>(L.outerStride());
-  const int ldb = static_cast<int>(B.outerStride());
+  const int n = static_cast<int>(L.rows()), n_columns = static_cast<int>(B.cols());
+  const Block of_L = block_of(L);
   if (n == 0 || n_columns == 0) return;
-  if (n_columns == 1) {
-    // half the time of dtrsm, which packs L first
-    const int step = 1;
-    dtrsv_("L", transposed ? "T" : "N", "N", &n, L.data(), &lda, B.data(), &step, 1, 1, 1);
-    return;
-  }
-  // written to nowhere: Block is one type for both
-  solve_lower(n, {const_cast<double*>(L.data()), lda}, transposed, n_columns,
-              {B.data(), ldb});  // NOLINT(cppcoreguidelines-pro-type-const-cast)
+  if (n_columns > 1) return solve_lower(n, of_L, transposed, n_columns, block_of(B));
+  // half the time of dtrsm, which packs L first
+  const int step = 1;
+  dtrsv_("L", transposed ? "T" : "N", "N", &n, of_L.data, &of_L.stride, B.data(), &step, 1, 1, 1);
 }
 
 void solve_factored(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B) {
@@ -275,23 +272,23 @@ void solve_factored(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen
 
 void multiply_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B) {
   const BufferInUse buffer;
-  const int n = static_cast<int>(L.rows()), n_columns = static_cast<int>(B.cols()), lda = static_cast<int>(L.outerStride()),
-            ldb = static_cast<int>(B.outerStride());
+  const int n = static_cast<int>(L.rows()), n_columns = static_cast<int>(B.cols());
+  const Block of_L = block_of(L), of_B = block_of(B);
   const double one = 1;
   if (n == 0 || n_columns == 0) return;
-  dtrmm_("L", "L", "N", "N", &n, &n_columns, &one, L.data(), &lda, B.data(), &ldb, 1, 1, 1, 1);
+  dtrmm_("L", "L", "N", "N", &n, &n_columns, &one, of_L.data, &of_L.stride, of_B.data, &of_B.stride, 1, 1, 1, 1);
 }
 
 void add_product(const Eigen::Ref<const Eigen::MatrixXd>& A, bool transposed_A, const Eigen::Ref<const Eigen::MatrixXd>& B,
                  bool transposed_B, Eigen::Ref<Eigen::MatrixXd> C) {
   const BufferInUse buffer;
   const int m = static_cast<int>(C.rows()), n = static_cast<int>(C.cols()),
-            k = static_cast<int>(transposed_A ? A.rows() : A.cols()), lda = static_cast<int>(A.outerStride()),
-            ldb = static_cast<int>(B.outerStride()), ldc = static_cast<int>(C.outerStride());
+            k = static_cast<int>(transposed_A ? A.rows() : A.cols());
+  const Block of_A = block_of(A), of_B = block_of(B), of_C = block_of(C);
   const double one = 1;
   if (m == 0 || n == 0 || k == 0) return;
-  dgemm_(transposed_A ? "T" : "N", transposed_B ? "T" : "N", &m, &n, &k, &one, A.data(), &lda, B.data(), &ldb, &one, C.data(),
-         &ldc, 1, 1);
+  dgemm_(transposed_A ? "T" : "N", transposed_B ? "T" : "N", &m, &n, &k, &one, of_A.data, &of_A.stride, of_B.data, &of_B.stride,
+         &one, of_C.data, &of_C.stride, 1, 1);
 }
 
 void add_symmetric_product(const Eigen::Ref<const Eigen::MatrixXd>& A, const Eigen::Ref<const Eigen::MatrixXd>& B,
@@ -307,11 +304,11 @@ void add_symmetric_product(const Eigen::Ref<const Eigen::MatrixXd>& A, const Eig
 
 void add_square(const Eigen::Ref<const Eigen::MatrixXd>& A, Eigen::Ref<Eigen::MatrixXd> C) {
   const BufferInUse buffer;
-  const int n = static_cast<int>(A.rows()), k = static_cast<int>(A.cols()), lda = static_cast<int>(A.outerStride()),
-            ldc = static_cast<int>(C.outerStride());
+  const int n = static_cast<int>(A.rows()), k = static_cast<int>(A.cols());
+  const Block of_A = block_of(A), of_C = block_of(C);
   const double one = 1;
   if (n == 0 || k == 0) return;
-  dsyrk_("L", "N", &n, &k, &one, A.data(), &lda, &one, C.data(), &ldc, 1, 1);
+  dsyrk_("L", "N", &n, &k, &one, of_A.data, &of_A.stride, &one, of_C.data, &of_C.stride, 1, 1);
 }
 
 SingleThread::SingleThread() {

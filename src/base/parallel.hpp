@@ -10,12 +10,12 @@
 
 namespace gp2 {
 
-/// 0 means as many as the machine has.
+/// How many threads to use: `wanted`, or as many as the machine has where that is 0.
 inline int thread_count(int wanted) {
   return wanted > 0 ? wanted : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
 }
 
-/// Whether a caller asks for an end; null: never.
+/// Whether a stop was requested; null: never.
 inline bool is_set(const std::atomic<bool>* stop) { return stop != nullptr && stop->load(); }
 
 /// Calls work(task, thread) once for every task 0 … n_tasks − 1, in an order that differs from run to run, on the calling thread

@@ -142,38 +142,31 @@ void exponential(Size n, T* x) {
   for (Size i = 0; i < n; i += V::width) V::store(x + i, V::exponential(V::load(x + i)));
 }
 
+// of m columns of B at once, which stay in registers
+template <typename T, int m>
+inline void weighted_sums(Size n, const T* w, const T* B, Size ldb, T* out) {
+  using V = Vector<T>;
+  typename V::Type sums[m] = {}, more[m] = {};
+  Size i = 0;
+  for (; i + 2 * V::width <= n; i += 2 * V::width) {
+    const typename V::Type w0 = V::load(w + i), w1 = V::load(w + i + V::width);
+    for (int k = 0; k < m; ++k) {
+      sums[k] += w0 * V::load(B + k * ldb + i);
+      more[k] += w1 * V::load(B + k * ldb + i + V::width);
+    }
+  }
+  for (; i < n; i += V::width) {
+    const typename V::Type w0 = V::load(w + i);
+    for (int k = 0; k < m; ++k) sums[k] += w0 * V::load(B + k * ldb + i);
+  }
+  for (int k = 0; k < m; ++k) out[k] = V::sum(sums[k] + more[k]);
+}
+
 template <typename T>
 void weighted_sums(Size n, Size m, const T* w, const T* B, Size ldb, T* out) {
-  using V = Vector<T>;
   Size l = 0;
-  for (; l + 3 <= m; l += 3) {
-    typename V::Type sums[3] = {}, more[3] = {};
-    const T* const b = B + l * ldb;
-    Size i = 0;
-    for (; i + 2 * V::width <= n; i += 2 * V::width) {
-      const typename V::Type w0 = V::load(w + i), w1 = V::load(w + i + V::width);
-      for (int k = 0; k < 3; ++k) {
-        sums[k] += w0 * V::load(b + k * ldb + i);
-        more[k] += w1 * V::load(b + k * ldb + i + V::width);
-      }
-    }
-    for (; i < n; i += V::width) {
-      const typename V::Type w0 = V::load(w + i);
-      for (int k = 0; k < 3; ++k) sums[k] += w0 * V::load(b + k * ldb + i);
-    }
-    for (int k = 0; k < 3; ++k) out[l + k] = V::sum(sums[k] + more[k]);
-  }
-  for (; l < m; ++l) {
-    typename V::Type sums = {}, more = {};
-    const T* const b = B + l * ldb;
-    Size i = 0;
-    for (; i + 2 * V::width <= n; i += 2 * V::width) {
-      sums += V::load(w + i) * V::load(b + i);
-      more += V::load(w + i + V::width) * V::load(b + i + V::width);
-    }
-    for (; i < n; i += V::width) sums += V::load(w + i) * V::load(b + i);
-    out[l] = V::sum(sums + more);
-  }
+  for (; l + 3 <= m; l += 3) weighted_sums<T, 3>(n, w, B + l * ldb, ldb, out + l);
+  for (; l < m; ++l) weighted_sums<T, 1>(n, w, B + l * ldb, ldb, out + l);
 }
 
 template <typename T>

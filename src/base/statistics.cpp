@@ -48,6 +48,16 @@ VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
   return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
 }
 
+VectorXd row_size(const Eigen::Ref<const MatrixXd>& values) {
+  if (values.cols() == 0) return VectorXd::Zero(values.rows());
+  return values.array().isNaN().select(0, values).cwiseAbs().rowwise().maxCoeff();
+}
+
+VectorXd row_spread(const Eigen::Ref<const MatrixXd>& values) {
+  const VectorXd stddev = row_stddev(values);
+  return (stddev.array() > 1e-12 * row_size(values).array()).select(stddev, 0);
+}
+
 double median(std::vector<double> values) {
   const auto middle = values.begin() + std::ssize(values) / 2;
   std::nth_element(values.begin(), middle, values.end());

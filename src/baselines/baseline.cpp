@@ -41,9 +41,9 @@ MatrixXd pooled_features(const std::vector<Observations>& observations, const Pr
   });
 }
 
-// of each row; 1 where it is constant
+// of each row; 1 where it is constant, to rounding
 VectorXd usable_stddev(const MatrixXd& values) {
-  const VectorXd stddev = row_stddev(values);
+  const VectorXd stddev = row_spread(values);
   return (stddev.array() > 0).select(stddev, VectorXd::Ones(stddev.size()));
 }
 
@@ -117,6 +117,19 @@ Fit fit_output(int output, const Prior& prior, const std::vector<Observations>& 
   return fitted;
 }
 
+// An output after the first that is stopped before it has anything stands where it starts.
+FitReport report_of_output(int output, const Prior& prior, const std::vector<Observations>& observations,
+                           const std::vector<Hyperparameter>& hyperparameters, FitOptions options) {
+  try {
+    return fit_output(output, prior, observations, hyperparameters, options).report;
+  } catch (const NumericalError&) {
+    if (output == 0 || !is_set(options.stop)) throw;
+  }
+  options.stop = nullptr;
+  options.max_iterations = 0;
+  return fit_output(output, prior, observations, hyperparameters, options).report;
+}
+
 Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observations,
                 const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options) {
   const int n_outputs = prior.system->nq();
@@ -134,7 +147,7 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
         options.progress(p);
       };
     }
-    FitReport report = fit_output(output, prior, observations, hyperparameters, own).report;
+    FitReport report = report_of_output(output, prior, observations, hyperparameters, own);
     std::stable_sort(report.restarts.begin(), report.restarts.end(),
                      [](const auto& a, const auto& b) { return a.objective < b.objective; });
     RestartReport none;

@@ -122,6 +122,7 @@ std::vector<LoadingEntry> loading_entries(const Latent& latent) {
 }
 
 Baseline unstandardised(const Model& model, Baseline::Kind kind) {
+  require_system(model.system);
   const auto n_features = static_cast<Index>(Parts(model).names.size());
   using Eigen::VectorXd;
   return {kind, VectorXd::Zero(model.system->nq()), VectorXd::Zero(n_features), VectorXd::Ones(n_features)};

@@ -308,10 +308,6 @@ void for_each_line_of(const std::filesystem::path& path, const Take& take,
   if (!rest.empty()) take(std::string_view(rest));
 }
 
-}  // namespace
-
-namespace {
-
 constexpr std::size_t piece_size = std::size_t{1} << 20;
 
 /// The lines of a file that begin within one stretch of its bytes, and the checksum of these bytes.
@@ -349,7 +345,7 @@ void for_each_line(std::string_view text, const Take& take) {
 // where one is not: what is to be said or kept of it is for Builder::add_line.
 std::optional<std::vector<double>> plain_cells(std::string_view lines, std::size_t n_columns) {
   std::vector<double> cells;
-  bool is_plain = true;
+  bool is_plain = n_columns > 0;  // or the header is still to come
   for_each_line(lines, [&](std::string_view line) {
     line = trim(line);
     const char* at = line.data();

@@ -50,6 +50,11 @@ std::string whole_body(const std::string& text) {
 
 }  // namespace
 
+// A function of one latent, whose name goes to the texts of the latent.
+void Writer::write_of(Term& term, const std::string& what, const std::string& head, const std::string& body) {
+  term.filling.texts[what] = function(fmt::format("{}_{}", what, &term - terms_.data()), head, body);
+}
+
 // The gradient of a potential, kernel by kernel of its sum (theory.md, T44)
 void Writer::write_potential(Term& term) {
   std::string pairs, sums, slopes, products, variance;
@@ -72,17 +77,14 @@ void Writer::write_potential(Term& term) {
                             square, factor.first_column, factor.primitive == Primitive::matern52 ? " * 5 / 3" : "");
     first += 3 + term.D;
   }
-  const auto write = [&](const std::string& what, const std::string& head, const std::string& body) {
-    term.filling.texts[what] = function(fmt::format("{}_{}", what, &term - terms_.data()), head, body);
-  };
   const std::string to_out = "const latent *a, const real *pairs, real *scratch, real *out";
-  write("pairs", "const latent *a, const real *p, real *pairs", pairs);
-  write("sums", to_out, from_zero(std::to_string(term.D), sums));
-  if (has("jacobian")) write("gradient", to_out, from_zero(std::to_string(term.D * term.D), slopes));
+  write_of(term, "pairs", "const latent *a, const real *p, real *pairs", pairs);
+  write_of(term, "sums", to_out, from_zero(std::to_string(term.D), sums));
+  if (has("jacobian")) write_of(term, "gradient", to_out, from_zero(std::to_string(term.D * term.D), slopes));
   if (!has("stddev")) return;
-  write("products", "const latent *a, const real *pairs, const real *loading, real *scratch, real *out",
-        from_zero(fmt::format("{} * a->n", term.D), products));
-  write("variance", "const latent *a, real *out", from_zero(std::to_string(term.D), variance));
+  write_of(term, "products", "const latent *a, const real *pairs, const real *loading, real *scratch, real *out",
+           from_zero(fmt::format("{} * a->n", term.D), products));
+  write_of(term, "variance", "const latent *a, real *out", from_zero(std::to_string(term.D), variance));
 }
 
 void Writer::write_kernel(Term& term) {
@@ -122,18 +124,15 @@ void Writer::write_kernel(Term& term) {
     variance += fmt::format("  sum += {};\n", at_zero);
     is_first = false;
   }
-  const auto write = [&](const std::string& what, const std::string& head, const std::string& body) {
-    term.filling.texts[what] = function(fmt::format("{}_{}", what, &term - terms_.data()), head, body);
-  };
-  write("covariance", "const latent *a, const real *p, real *k, real *scratch", whole_body(k));
+  write_of(term, "covariance", "const latent *a, const real *p, real *k, real *scratch", whole_body(k));
   if (has("stddev")) {
     const bool reads_a = variance.find("a->") != std::string::npos;
-    write("variance", "const latent *a, const real *p, real *out",
-          fmt::format("{}{}{}  *out = sum;\n", reads_a ? "" : "  (void)a;\n", is_constant ? "  (void)p;\n" : "", variance));
+    write_of(term, "variance", "const latent *a, const real *p, real *out",
+             fmt::format("{}{}{}  *out = sum;\n", reads_a ? "" : "  (void)a;\n", is_constant ? "  (void)p;\n" : "", variance));
   }
   if (has("jacobian") && term.features_vary()) {
-    write("gradient", "const latent *a, const real *p, const real *k, real *scratch, real *out",
-          whole_body(from_zero(std::to_string(D * term.p), gradient)));
+    write_of(term, "gradient", "const latent *a, const real *p, const real *k, real *scratch, real *out",
+             whole_body(from_zero(std::to_string(D * term.p), gradient)));
   }
 }
 

@@ -48,27 +48,21 @@ void Writer::write_latents() {
     });
     ++a;
   }
-  const auto write = [&](const std::string& name, std::string_view form, bool is_asked) {
-    std::string& of_all = text(name);
-    for (const Term& term : terms_) {
-      if (is_asked) of_all += filled(form, term.filling);
-    }
-  };
-  // what acts on the load is there beside what is viewed
-  const auto write_all = [&](const std::string& name, std::string_view form, bool is_asked) {
+  // latents that are not viewed are there where the load of the whole motion is looked for and, `always`, in its deviation
+  const auto write = [&](const std::string& name, std::string_view form, bool is_asked, bool always) {
     std::string& of_all = text(name);
     for (const Term& term : terms_) {
       if (!is_asked) continue;
       const std::string code = filled(form, term.filling);
-      of_all += term.is_viewed ? code : fmt::format("  if (!w->is_part) {{\n{}  }}\n", code);
+      of_all += term.is_viewed || always ? code : fmt::format("  if (!w->is_part) {{\n{}  }}\n", code);
     }
   };
-  write_all("signals", signal_template, true);
-  write_all("under_load", under_load_template, has("nonlinear"));
-  write("loadings", loading_template, has("stddev"));
-  write("cross_by_row", cross_by_row_template, has("stddev") && !has("by_function"));
-  write("cross_by_function", cross_by_function_template, has("stddev") && has("by_function"));
-  write_all("dsignals", dsignal_template, has("jacobian"));
+  write("signals", signal_template, true, false);
+  write("under_load", under_load_template, has("nonlinear"), false);
+  write("loadings", loading_template, has("stddev"), true);
+  write("cross_by_row", cross_by_row_template, has("stddev") && !has("by_function"), true);
+  write("cross_by_function", cross_by_function_template, has("stddev") && has("by_function"), true);
+  write("dsignals", dsignal_template, has("jacobian"), false);
   const auto any = [&](const auto& holds) { return std::any_of(terms_.begin(), terms_.end(), holds); };
   if (any([](const Term& term) { return term.features_vary() || term.directions_vary(); })) {
     filling_.conditions.insert("dsignals_read_component");

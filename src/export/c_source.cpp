@@ -26,7 +26,11 @@ void Writer::write_comments() {
                        has("mixture") ? fmt::format(", a mixture over {} draws of hyperparameters", components_.size()) : "");
   for (const std::string& line : options_.about) about += " * " + in_comment(line) + "\n";
   std::string& obeyed = text("obeyed");
-  for (const std::string& label : system().constraint_labels()) obeyed += in_comment(fmt::format(" * It obeys {} = 0.\n", label));
+  for (std::size_t row = 0; row < system().constraint_labels().size(); ++row) {
+    const std::string& condition = system().constraint_conditions()[row];
+    obeyed += in_comment(fmt::format(" * It obeys {} = 0{}{}.\n", system().constraint_labels()[row],
+                                     condition.empty() ? "" : " where ", condition));
+  }
   const auto stated = [&](const std::string& name) -> std::string {
     const auto found = options_.units.find(name.substr(0, name.find('@')));
     return found == options_.units.end() ? "" : fmt::format(" [{}]", found->second);

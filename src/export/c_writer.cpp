@@ -10,6 +10,7 @@
 #include "gp2/error.hpp"
 #include "inference/requirements.hpp"
 #include "prior/primitive.hpp"
+#include "symbolic/functions.hpp"
 
 namespace gp2::c_export {
 
@@ -126,6 +127,14 @@ void Writer::add_terms() {
 
 void Writer::set_names() {
   std::set<std::string> taken = taken_names();
+  // what expressions call: no number beside them may hide it
+  for (const char* const called : {"sign_of", "smaller", "larger", "product_or_zero", "square", "integer_power", "pow", "powf"}) {
+    taken.insert(called);
+  }
+  for (const internal::Function& function : internal::functions) {
+    taken.emplace(function.c);
+    taken.insert(std::string(function.c) + "f");
+  }
   const auto add_name = [&](std::string name, std::vector<std::string>& names) {
     for (char& c : name) {
       if (!std::isalnum(static_cast<unsigned char>(c))) c = '_';

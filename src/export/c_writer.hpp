@@ -94,6 +94,7 @@ class Writer {
 
   // c_kernels.cpp
   void write_kernels();
+  void write_of(Term& term, const std::string& what, const std::string& head, const std::string& body);
   void write_kernel(Term& term);
   void write_potential(Term& term);
 

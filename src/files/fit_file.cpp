@@ -76,8 +76,10 @@ void FitFile::take_data(const Posterior& posterior) {
   observations = posterior.observations();
   if (!report.inducing) return;
   const std::shared_ptr<const InducingSummary> before = std::exchange(report.inducing->summary, posterior.summary());
-  // scores are of the data that there were
-  if (before && before->kept.n_states != report.inducing->summary->kept.n_states) report.inducing->stretches.reset();
+  if (!before) return;
+  // scores are of the data that there were, and of what was not forgotten of them
+  const KeptStates &then = before->kept, &now = report.inducing->summary->kept;
+  if (then.n_states != now.n_states || then.share_of != now.share_of) report.inducing->stretches.reset();
 }
 
 Posterior FitFile::posterior() const { return posterior_of(prior(), observations, report); }

@@ -65,7 +65,8 @@ HyperPrior hyperprior_from(const ParsedJson& json) {
     json.at("family").get_to(prior.family);
     prior.correlation = number(json.at("correlation"));
   }
-  return prior.stddev > 0 ? prior : HyperPrior{};
+  if (!(prior.stddev > 0)) throw InputError(fmt::format("the deviation of a prior must be positive, got {}", prior.stddev));
+  return prior;
 }
 
 // The kind of a hyperparameter, and whether it is positive.

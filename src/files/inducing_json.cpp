@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cstdint>
 
 #include "base/not_a_number.hpp"
@@ -52,7 +53,23 @@ Json summary_json(const InducingSummary& summary) {
                           {"constant", all.constant},
                           {"weight", vector_json(all.weight)}});
   }
-  return {{"states", summary.kept.n_states}, {"step", summary.kept.step}, {"components", components}};
+  Json json = {{"states", summary.kept.n_states}, {"step", summary.kept.step}, {"components", components}};
+  if (!summary.kept.share_of.empty()) json["shares"] = summary.kept.share_of;
+  return json;
+}
+
+// Shares of the likelihood, of each state that is kept.
+std::vector<std::vector<double>> shares_from(const ParsedJson& json, const std::vector<Observations>& observations) {
+  std::vector<std::vector<double>> shares;
+  for (const ParsedJson& of_group : array(json)) {
+    const VectorXd one = vector_from(of_group);
+    if (!(one.array() >= 0 && one.array() <= 1).all()) throw InputError("shares of states must be from 0 to 1");
+    shares.emplace_back(one.begin(), one.end());
+  }
+  const bool is_of_each = std::ranges::equal(
+      shares, observations, [](const auto& one, const Observations& group) { return std::ssize(one) == group.n_data(); });
+  if (!is_of_each) throw InputError("shares of some states only");
+  return shares;
 }
 
 InducingSummary::Component component_from(const ParsedJson& json, const Prior& prior, const ModelValues& values) {
@@ -148,6 +165,7 @@ std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, cons
     throw InputError(
         fmt::format("numbers of states of {} of {} observations", summary.kept.n_states.size(), observations.size()));
   }
+  if (json.contains("shares")) summary.kept.share_of = shares_from(json.at("shares"), observations);
   if (!json.contains("components")) {  // of one, before version 11
     summary.components.push_back(component_from(json, prior, values.front()));
   } else {

@@ -32,10 +32,8 @@ View view_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const 
     if (!(time_step > 0)) throw InputError(fmt::format("the time_step of {} must be positive", word));
     view.time_step = time_step;
   }
-  const int latent = integer(json.at("latent"));
-  if (latent < -1 || latent >= static_cast<int>(prior.latents.size())) {
-    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", latent, prior.latents.size() - 1));
-  }
+  const int latent = integer(json.at("latent")), last = static_cast<int>(prior.latents.size()) - 1;
+  if (latent < -1 || latent > last) throw InputError(fmt::format("latent {} of a view is outside -1 … {}", latent, last));
   if (latent >= 0) view.latent = {latent, json.contains("n_latents") ? integer(json.at("n_latents")) : 1};
   const int n_rows = View::all(*quantity, *prior.system).size();
   for (const ParsedJson& row : array(json.at("rows"))) {

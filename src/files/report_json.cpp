@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <map>
 
 #include "files/fit_json.hpp"
@@ -151,6 +152,7 @@ Json actuators_json(const std::vector<ActuatorEstimate>& estimates) {
   for (const ActuatorEstimate& one : estimates) {
     json.push_back(
         {{"name", one.name}, {"value", one.value}, {"stddev", one.stddev}, {"lower", one.lower}, {"upper", one.upper}});
+    if (std::isinf(one.stddev)) json.back()["undetermined"] = true;  // stddev is null, as where it is NaN
   }
   return json;
 }
@@ -170,7 +172,8 @@ std::vector<ActuatorEstimate> actuators_from(const ParsedJson& json, std::vector
     values.emplace(estimate.name, estimate.value);
     estimate.lower = number(one.at("lower"));
     estimate.upper = number(one.at("upper"));
-    estimate.stddev = number_or_missing(one.at("stddev"));
+    const bool is_open = one.value("undetermined", false);
+    estimate.stddev = is_open ? std::numeric_limits<double>::infinity() : number_or_missing(one.at("stddev"));
   }
   set_values(values, actuators);
   return estimates;

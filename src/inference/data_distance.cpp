@@ -9,6 +9,7 @@
 
 #include "base/not_a_number.hpp"
 #include "base/simd.hpp"
+#include "data/evenly.hpp"
 
 namespace gp2 {
 
@@ -17,7 +18,7 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 using Primitive = Kernel::Primitive;
 
-double DataDistance::smallest(const Ref<const VectorXd>& z, Index first, Index last) const {
+double DataDistance::smallest(const Ref<const VectorXd>& z, Index first, Index last, double above) const {
   constexpr Index block = 64 * simd::lanes<double>;
   std::array<double, block> squares;
   double nearest = std::numeric_limits<double>::infinity();
@@ -25,7 +26,8 @@ double DataDistance::smallest(const Ref<const VectorXd>& z, Index first, Index l
     const Index n_rows = std::min(block, observed_.rows() - begin), n = std::min(block, n_observed_ - begin);
     simd::loops().squared_distance(n_rows, z.size(), observed_.data() + begin, observed_.rows(), z.data(), squares.data());
     for (Index i = 0; i < n; ++i) {
-      if (begin + i < first || begin + i >= last) nearest = std::min(nearest, squares[static_cast<std::size_t>(i)]);
+      const double square = squares[static_cast<std::size_t>(i)];
+      if ((begin + i < first || begin + i >= last) && square > above) nearest = std::min(nearest, square);
     }
   }
   return nearest;
@@ -38,8 +40,7 @@ double DataDistance::Coordinate::of(const Ref<const VectorXd>& features) const {
 
 DataDistance::DataDistance(const Posterior::Implementation& posterior, const View& view) {
   const Prior& prior = posterior.prior;
-  Index n_states = 0;
-  for (const Observations& group : posterior.observations) n_states += group.n_data();
+  const Index n_states = gp2::n_states(posterior.observations);
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
     // of what is observed, in units of the noise
@@ -86,7 +87,8 @@ void DataDistance::add_coordinates(std::size_t latent, const Kernel& kernel, con
 }
 
 // Rows of a log follow each other, so those around a state say nothing of how well its surroundings are known: a tenth of its log,
-// half before and half after, is left out. Nineteen of twenty observed states are nearer to the others than a unit.
+// half before and half after, is left out; so are states that are the same, as where a grid is measured twice. Nineteen of
+// twenty observed states are nearer to the others than a unit.
 void DataDistance::set_unit(const std::vector<Index>& n_of_group) {
   constexpr Index most = 1000;  // states that are looked at
   const Index step = std::max<Index>(1, n_observed_ / most);
@@ -97,7 +99,7 @@ void DataDistance::set_unit(const std::vector<Index>& n_of_group) {
     for (Index k = 0; k < n; k += step) {
       const Index i = first + k;
       const VectorXd z = observed_.row(i).transpose();
-      const double nearest = smallest(z, std::max(first, i - margin), std::min(first + n, i + margin + 1));
+      const double nearest = smallest(z, std::max(first, i - margin), std::min(first + n, i + margin + 1), 0);
       if (std::isfinite(nearest)) distances.push_back(std::sqrt(nearest));
     }
     first += n;
@@ -111,7 +113,7 @@ void DataDistance::set_unit(const std::vector<Index>& n_of_group) {
 
 double DataDistance::at(const Ref<const VectorXd>& z) const {
   if (z.size() == 0) return 0;
-  const double distance = std::sqrt(smallest(z, 0, 0));
+  const double distance = std::sqrt(smallest(z, 0, 0, -1));
   if (distance == 0 || std::isinf(distance)) return distance;
   return distance / unit_;
 }

@@ -13,7 +13,7 @@ namespace gp2 {
 ///
 ///     D²(x, x') = |z − z'|² = Σ_a v_a Σ_terms w² Σ_factors r²(φ_a, φ'_a),
 ///
-/// in units of what D is between an observed state and those observed at other times.
+/// in units of what D is between an observed state and other ones observed at other times.
 class DataDistance {
  public:
   DataDistance() = default;
@@ -43,8 +43,9 @@ class DataDistance {
   void add_coordinates(std::size_t latent, const Kernel& kernel, const Eigen::VectorXd& values, double variance);
   /// @param n_of_group  observed states of each Observations, one after the other
   void set_unit(const std::vector<Eigen::Index>& n_of_group);
-  // the smallest |z − z_j|² over the observed states but those from `first` to before `last`; allocates nothing
-  [[nodiscard]] double smallest(const Eigen::Ref<const Eigen::VectorXd>& z, Eigen::Index first, Eigen::Index last) const;
+  // the smallest |z − z_j|² above a number, over the observed states but those from `first` to before `last`; allocates nothing
+  [[nodiscard]] double smallest(const Eigen::Ref<const Eigen::VectorXd>& z, Eigen::Index first, Eigen::Index last,
+                                double above) const;
 
   std::vector<Coordinate> coordinates_;
   Eigen::MatrixXd observed_;  // z of the observed states, group after group, padded (simd.hpp)  (N × coordinates)

@@ -81,7 +81,8 @@ GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<
   return gradient;
 }
 
-LatentPosterior::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) {
+LatentPosterior::Inverse DenseGram::invert(const LatentRows& rows, const LatentPosterior::SampleSets& states,
+                                           const LatentPosterior::SampleSets& sets) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
   LatentPosterior::Inverse inverse{factor_.solve(), {}, {}};
   const Ref<const MatrixXd> P = factor_.invert();
@@ -96,12 +97,14 @@ LatentPosterior::Inverse DenseGram::invert(const LatentRows& rows, const std::ve
     }
     return P_of;
   };
-  for (Index sample = 0; sample < rows.n_samples(); ++sample)
-    inverse.blocks.push_back(block(rows_of_samples(reduction, {sample})));
+  for (const std::vector<Index>& state : states) inverse.blocks.push_back(block(rows_of_samples(reduction, state)));
   for (const std::vector<Index>& set : sets) {
     const std::vector<Index> of = rows_of_samples(reduction, set);
     const Eigen::LLT<MatrixXd> factor(block(of));
-    if (factor.info() != Eigen::Success) return {std::move(inverse.alpha), std::move(inverse.blocks), {}};
+    if (factor.info() != Eigen::Success) {
+      inverse.without.clear();
+      return inverse;
+    }
     const VectorXd pull = factor.solve(inverse.alpha(of));
     const MatrixXd root = factor.matrixL().solve(MatrixXd::Identity(pull.size(), pull.size()));
     LatentPosterior::WithoutSet& without = inverse.without.emplace_back();

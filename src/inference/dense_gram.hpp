@@ -24,7 +24,8 @@ class DenseGram final : public Gram {
   [[nodiscard]] std::optional<GramValue> factorise(const LatentRows& rows);
   /// Once after factorise of the same rows; so is invert.
   [[nodiscard]] GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts);
-  [[nodiscard]] LatentPosterior::Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets);
+  [[nodiscard]] LatentPosterior::Inverse invert(const LatentRows& rows, const LatentPosterior::SampleSets& states,
+                                                const LatentPosterior::SampleSets& sets);
 
  private:
   [[nodiscard]] int n_threads(const LatentRows& rows) const;
@@ -42,8 +43,6 @@ class DensePosterior final : public LatentPosterior {
  public:
   /// Without observations; latents and kernels as those of `like`.
   explicit DensePosterior(const LatentRows& like);
-  /// Null where K̃ + I is not positive definite in double precision.
-  [[nodiscard]] static std::unique_ptr<LatentPosterior> condition(const LatentRows& rows);
   [[nodiscard]] std::unique_ptr<LatentPosterior> clone() const override;
 
   [[nodiscard]] Eigen::Index size() const override { return factor_.size(); }
@@ -56,7 +55,7 @@ class DensePosterior final : public LatentPosterior {
   [[nodiscard]] std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const override;
   [[nodiscard]] bool append(const RowBlocks& more) override;
   [[nodiscard]] bool append(const LatentRows& more);
-  [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const override;
+  [[nodiscard]] Inverse invert(const LatentRows& rows, const SampleSets& states, const SampleSets& sets) const override;
   void erase(const std::vector<Eigen::Index>& samples) override;
   void forget(double /*share*/) override { assert(false); }
 

@@ -83,8 +83,7 @@ VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& ra
   return misfit;
 }
 
-std::vector<std::vector<MatrixXd>> DensePosterior::weights(MatrixXd misfits) const {
-  MatrixXd& alpha = misfits;
+std::vector<std::vector<MatrixXd>> DensePosterior::weights(MatrixXd alpha) const {
   lapack::solve_factored(factor_.L(), alpha);
   std::vector<std::vector<MatrixXd>> weights;
   for (Index column = 0; column < alpha.cols(); ++column) {
@@ -119,16 +118,10 @@ void DensePosterior::refresh_weights() {
   for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = latent_weights(a, alpha);
 }
 
-std::unique_ptr<LatentPosterior> DensePosterior::condition(const LatentRows& rows) {
-  auto posterior = std::make_unique<DensePosterior>(rows);
-  if (!posterior->append(rows)) return nullptr;
-  return posterior;
-}
-
-LatentPosterior::Inverse DensePosterior::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) const {
+LatentPosterior::Inverse DensePosterior::invert(const LatentRows& rows, const SampleSets& states, const SampleSets& sets) const {
   DenseGram gram;
   if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
-  return gram.invert(rows, sets);
+  return gram.invert(rows, states, sets);
 }
 
 bool DensePosterior::append(const RowBlocks& more) {

@@ -7,6 +7,7 @@
 #include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
 #include "data/evenly.hpp"
@@ -95,30 +96,43 @@ struct Scores {
   }
 };
 
-// Calls visit(group number, row of its view) for all observations of row `row` of ddq.
+// Of the latent that is viewed alone; empty where all are.
+std::string latent_name(const Prior& prior, const View& view) {
+  return view.latent ? prior.latents[static_cast<std::size_t>(view.latent->first)].name : "";
+}
+
+// A quantity, or what one latent adds to it, under whatever system it is observed.
+struct Observed {
+  View::Quantity quantity = View::Quantity::constrained_acceleration;
+  std::optional<LatentRange> latent = {};
+
+  [[nodiscard]] bool has(const View& view) const { return view.quantity == quantity && view.latent == latent; }
+};
+
+// Calls visit(group number, row of its view) for all observations of row `row`.
 template <typename Visit>
-void for_each_observed(const std::vector<Observations>& observations, int row, const Visit& visit) {
+void for_each_observed(const std::vector<Observations>& observations, const Observed& of, int row, const Visit& visit) {
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const View& view = observations[g].view();
-    if (!view.is_of_ddq()) continue;
+    if (!of.has(view)) continue;
     const auto found = std::find(view.rows.begin(), view.rows.end(), row);
     if (found != view.rows.end()) visit(g, found - view.rows.begin());
   }
 }
 
-// The rows of ddq that any observation has, in order.
-std::vector<int> rows_of(const std::vector<Observations>& observations) {
+// The rows that any observation has, in order.
+std::vector<int> rows_of(const std::vector<Observations>& observations, const Observed& of) {
   std::set<int> rows;
   for (const Observations& group : observations) {
-    if (group.view().is_of_ddq()) rows.insert(group.view().rows.begin(), group.view().rows.end());
+    if (of.has(group.view())) rows.insert(group.view().rows.begin(), group.view().rows.end());
   }
   return {rows.begin(), rows.end()};
 }
 
-// Standard deviation of row `row` of ddq over all observations of it; NaN where there are none.
-double training_spread(const std::vector<Observations>& observations, int row) {
+// Standard deviation of row `row` over all observations of it; NaN where there are none.
+double training_spread(const std::vector<Observations>& observations, const Observed& of, int row) {
   std::vector<double> values;
-  for_each_observed(observations, row, [&](std::size_t g, Index k) {
+  for_each_observed(observations, of, row, [&](std::size_t g, Index k) {
     const auto observed = observations[g].values().row(k);
     values.insert(values.end(), observed.begin(), observed.end());
   });
@@ -168,19 +182,20 @@ VectorXd central_coverage(const Ref<const VectorXd>& z, const Ref<const VectorXd
 }
 
 VectorXd pit_histogram(const Ref<const VectorXd>& z, int n_bins) {
+  if (n_bins < 1) throw InputError(fmt::format("pit_histogram: n_bins must be 1 or more, got {}", n_bins));
   PitCounts counts(n_bins);
   for (const double one : z) counts.add(one);
   return counts.shares();
 }
 
-std::vector<int> observed_rows(const Posterior& posterior) { return rows_of(posterior.observations()); }
+std::vector<int> observed_rows(const Posterior& posterior) { return rows_of(posterior.observations(), {}); }
 
 MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
   MatrixXd noise(std::ssize(rows), n_states);
   for (Index r = 0; r < noise.rows(); ++r) {
     double usual = not_a_number, factor = 1;
     bool is_first = true, is_first_stated = true;
-    for_each_observed(posterior.observations(), rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
+    for_each_observed(posterior.observations(), {}, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
       const Observations& group = posterior.observations()[g];
       const VectorXd sigma = posterior.noise_stddev(g);
       if (std::exchange(is_first, false)) usual = group.usual_noise(sigma)[k];
@@ -216,7 +231,7 @@ bool TrainingResidual::is_too_large() const {
   return is_far || is_coverage_low(coverage95, n);
 }
 
-bool TrainingResidual::is_too_small() const { return n >= 20 && rms_in_noise < 0.5; }
+bool TrainingResidual::is_too_small() const { return is_of_ddq && n >= 20 && rms_in_noise < 0.5; }
 
 bool TrainingResidual::is_correlated() const {
   return n >= 30 && serial_correlation > 0.5 && serial_correlation > 4 / std::sqrt(n);
@@ -231,12 +246,13 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
   std::vector<TrainingResidual> residuals;
   for (std::size_t g = 0; g < left_out.size(); ++g) {
     const Observations& group = judged[g];
-    if (!group.view().is_of_ddq()) continue;
-    const std::vector<std::string> names = group.view().names(*prior_of(posterior.prior(), group.view()).system);
+    const Prior& prior = prior_of(posterior.prior(), group.view());
+    const std::vector<std::string> names = group.view().names(*prior.system, latent_name(prior, group.view()));
     const VectorXd noise = posterior.noise_stddev(g);
     for (Index k = 0; k < group.values().rows(); ++k) {
       TrainingResidual& one = residuals.emplace_back();
       one.group = g;
+      one.is_of_ddq = group.view().is_of_ddq();
       one.output = names[static_cast<std::size_t>(k)];
       double before = not_a_number, products = 0;
       std::vector<double> distances;
@@ -263,33 +279,34 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
         one.n_far = static_cast<int>(std::ranges::count_if(distances, [&](double z) { return z > distance; }));
       }
       one.coverage95 = errors.within.shares()[2];
-      // values that sums stand for are smoothed, and so their errors
-      one.serial_correlation = one.rms > 0 && are_all && !group.has_sums() ? products / one.rms : 0;
+      // values that sums stand for are smoothed, and so their errors; what is known of other views need not be of a motion
+      const bool is_motion = are_all && !group.has_sums() && one.is_of_ddq;
+      one.serial_correlation = one.rms > 0 && is_motion ? products / one.rms : 0;
       for (double* const square : {&one.rms, &one.rms_in_noise}) *square = std::sqrt(*square / std::max(1, one.n));
     }
   }
   return residuals;
 }
 
-// Of the measured values of ddq, row by row over all observations: add(scores, row, group number, row of its view, state).
+// Of the measured values, row by row over all observations: add(scores, row, group number, row of its view, state).
 template <typename Add>
-Evaluation::Part scores_of(const std::vector<Observations>& judged, const Add& add) {
-  const std::vector<int> rows = rows_of(judged);
+Evaluation::Part scores_of(const std::vector<Observations>& judged, const Observed& of, const Add& add) {
+  const std::vector<int> rows = rows_of(judged, of);
   Scores scores(std::ssize(rows));
   VectorXd spread(std::ssize(rows));
   for (Index r = 0; r < spread.size(); ++r) {
-    spread[r] = training_spread(judged, rows[static_cast<std::size_t>(r)]);
-    for_each_observed(judged, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
+    spread[r] = training_spread(judged, of, rows[static_cast<std::size_t>(r)]);
+    for_each_observed(judged, of, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
       for (Index i = 0; i < judged[g].n_data(); ++i) {
         if (!std::isnan(judged[g].values()(k, i))) add(scores, r, g, k, i);
       }
     });
   }
-  for (const Observations& group : judged) scores.n += group.view().is_of_ddq() ? group.n_data() : 0;
+  for (const Observations& group : judged) scores.n += of.has(group.view()) ? group.n_data() : 0;
   return scores.part(spread.norm());
 }
 
-// As measured, without slip: of each group of ddq (d × N).
+// As measured, without slip: of each group (d × N).
 std::vector<MatrixXd> noise_of_groups(const Posterior& posterior) {
   std::vector<MatrixXd> noise;
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
@@ -301,43 +318,64 @@ std::vector<MatrixXd> noise_of_groups(const Posterior& posterior) {
   return noise;
 }
 
-Evaluation::Part scores_of(const std::vector<Observations>& judged, const std::vector<LeaveOneOut>& left_out,
-                           const std::vector<MatrixXd>& noise) {
-  return scores_of(judged, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
-    scores.add(r, judged[g].values()(k, i) - left_out[g].mean(k, i), std::sqrt(left_out[g].variance(k, i)), noise[g](k, i),
-               /*has_variance=*/false);
-  });
-}
-
-// That the noise would have as errors, slip among it.
-double nrmse_of_noise(const Posterior& posterior, const std::vector<Observations>& judged, std::vector<MatrixXd> noise) {
-  for (std::size_t g = 0; g < noise.size(); ++g) {
+LeftOutScores scores_of(const Posterior& posterior, const std::vector<Observations>& judged, const LeftOut& left_out,
+                        const Observed& of) {
+  std::vector<MatrixXd> noise = noise_of_groups(posterior);
+  const auto part_of = [&](const std::vector<LeaveOneOut>& predicted) {
+    return scores_of(judged, of, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
+      if (std::isnan(predicted[g].mean(k, i))) return;  // double precision cannot tell
+      scores.add(r, judged[g].values()(k, i) - predicted[g].mean(k, i), std::sqrt(predicted[g].variance(k, i)), noise[g](k, i),
+                 /*has_variance=*/false);
+    });
+  };
+  LeftOutScores out{"", part_of(left_out.rows), std::nullopt, part_of(left_out.values), 0};
+  if (!left_out.stretches.empty()) out.stretches = part_of(left_out.stretches);
+  const Prior& prior = posterior.prior();
+  for (std::size_t g = 0; g < noise.size(); ++g) {  // slip among it
     const Observations& group = posterior.observations()[g];
-    if (group.view().is_of_ddq()) noise[g] = with_slip(posterior, group.view(), group.states(), std::move(noise[g]));
+    const View& view = group.view();
+    if (!of.has(view)) continue;
+    noise[g] = with_slip(posterior, view, group.states(), std::move(noise[g]));
+    if (!view.is_of_ddq()) out.view = view.quantity->word() + (view.latent ? "@" + latent_name(prior_of(prior, view), view) : "");
   }
-  const auto add = [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
+  const auto add_noise = [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
     scores.add(r, noise[g](k, i), 0, not_a_number, /*has_variance=*/false);
   };
-  return scores_of(judged, add).nrmse;
+  out.nrmse_of_noise = scores_of(judged, of, add_noise).nrmse;
+  return out;
 }
 
-// Whether stretches of the observations are stretches of time.
+// What is observed: ddq first, where it is, and all else in the order of the observations.
+std::vector<Observed> observed_views(const std::vector<Observations>& observations) {
+  std::vector<Observed> all;
+  for (const Observations& group : observations) {
+    const View& view = group.view();
+    if (std::ranges::any_of(all, [&](const Observed& one) { return one.has(view); })) continue;
+    all.insert(view.is_of_ddq() ? all.begin() : all.end(), {view.quantity, view.latent});
+  }
+  return all;
+}
+
+// Whether stretches of the observations, of ddq where it is observed, are stretches of time.
 bool has_stretches(const Posterior& posterior, bool has_time_order) {
   const int t = posterior.prior().system->layout().t();
-  for (const Observations& group : posterior.observations()) {
-    has_time_order = has_time_order || group.states().row(t).allFinite();
-  }
-  return has_time_order && posterior.n_states() >= 2 * CrossValidation::n_stretches;
+  const bool has_ddq = !observed_rows(posterior).empty();
+  const auto is_in_order = [&](const Observations& group) {
+    return has_time_order || (has_ddq && !group.view().is_of_ddq()) || group.states().row(t).allFinite();
+  };
+  return std::ranges::all_of(posterior.observations(), is_in_order) && posterior.n_states() >= 2 * CrossValidation::n_stretches;
 }
 
 }  // namespace
 
 CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& judged, bool has_time_order) {
   const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
-  const std::vector<MatrixXd> noise = noise_of_groups(posterior);
-  CrossValidation out{scores_of(judged, left_out.values, noise), std::nullopt,
-                      training_residuals(posterior, judged, left_out.values), nrmse_of_noise(posterior, judged, noise)};
-  if (!left_out.stretches.empty()) out.stretches = scores_of(judged, left_out.stretches, noise);
+  std::vector<LeftOutScores> of_views;
+  for (const Observed& of : observed_views(judged)) of_views.push_back(scores_of(posterior, judged, left_out, of));
+  CrossValidation out;
+  if (!of_views.empty()) static_cast<LeftOutScores&>(out) = of_views.front();
+  out.other_views.assign(of_views.begin() + (of_views.empty() ? 0 : 1), of_views.end());
+  out.residuals = training_residuals(posterior, judged, left_out.values);
   return out;
 }
 
@@ -348,11 +386,18 @@ CrossValidation cross_validate(const Posterior& posterior, bool has_time_order) 
 std::string CrossValidation::text() const {
   // values that do not vary have no spread to compare errors with
   const auto of_part = [](const Evaluation::Part& part, const char* nrmse, const char* coverage) {
-    const std::string error = std::isfinite(part.nrmse) ? fmt::format("{}{:.3g}, ", nrmse, part.nrmse) : "";
-    return error + fmt::format("{}{:.3g}", coverage, part.coverage95);
+    std::vector<std::string> figures;
+    if (std::isfinite(part.nrmse)) figures.push_back(fmt::format("{}{:.3g}", nrmse, part.nrmse));
+    if (std::isfinite(part.coverage95)) figures.push_back(fmt::format("{}{:.3g}", coverage, part.coverage95));
+    return figures.empty() ? "none" : fmt::format("{}", fmt::join(figures, ", "));
   };
-  std::string text = "left out one by one: " + of_part(one_by_one, "nrmse ", "95 % coverage ");
-  if (stretches) text += fmt::format("; in {} stretches of the log: {}", n_stretches, of_part(*stretches, "", ""));
+  const auto of_view = [&](const LeftOutScores& of) {
+    std::string text = (of.view.empty() ? "" : of.view + ": ") + of_part(of.one_by_one, "nrmse ", "95 % coverage ");
+    if (of.stretches) text += fmt::format("; in {} stretches of the log: {}", n_stretches, of_part(*of.stretches, "", ""));
+    return text;
+  };
+  std::string text = "left out row by row: " + of_view(*this);
+  for (const LeftOutScores& of : other_views) text += "; " + of_view(of);
   return text;
 }
 
@@ -372,15 +417,6 @@ std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
   return constraint_residuals(system, states, parameters_of(view, posterior.values().parameters), accelerations, stddev);
 }
 
-namespace {
-
-// NaN stays
-void add_largest(double one, double& largest) {
-  if (!std::isnan(largest) && !(one <= largest)) largest = one;
-}
-
-}  // namespace
-
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
                                 const Ref<const MatrixXd>& targets, const EvaluationOptions& options) {
   View all = View::constrained_acceleration(*posterior.prior().system);
@@ -388,17 +424,20 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   View compared = all;
   compared.rows = rows;
   require_view(posterior.prior(), compared);
-  if (targets.rows() != std::ssize(rows) || targets.cols() != states.cols()) {
-    throw InputError(fmt::format("evaluate_predictions: targets must be {} × {}, got {} × {}", rows.size(), states.cols(),
-                                 targets.rows(), targets.cols()));
-  }
+  const auto require_shape = [&](const char* what, Index n_rows, Index n_columns) {
+    if (n_rows == std::ssize(rows) && n_columns == states.cols()) return;
+    throw InputError(fmt::format("evaluate_predictions: {} must be {} × {}, got {} × {}", what, rows.size(), states.cols(),
+                                 n_rows, n_columns));
+  };
+  const MatrixXd& given_noise = options.noise_stddev;
+  require_shape("targets", targets.rows(), targets.cols());
+  if (given_noise.size() > 0) require_shape("noise_stddev", given_noise.rows(), given_noise.cols());
   const Prior& prior = prior_of(posterior.prior(), all);
   const System& system = prior.reference_system();
   const VectorXd parameters = parameters_of(all, posterior.values().parameters);
   const auto decided = decided_entries(*prior.system, states, parameters, options.n_threads);
-  const MatrixXd noise =
-      with_slip(posterior, compared, states,
-                options.noise_stddev.size() > 0 ? options.noise_stddev : measurement_noise(posterior, rows, states.cols()));
+  const MatrixXd noise = with_slip(posterior, compared, states,
+                                   given_noise.size() > 0 ? given_noise : measurement_noise(posterior, rows, states.cols()));
 
   Evaluation e;
   e.n = static_cast<int>(states.cols());
@@ -426,6 +465,9 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
       }
     }
     const auto states_here = states.middleCols(first, stddev.cols());
+    const auto add_largest = [](double one, double& largest) {
+      if (!std::isnan(largest) && !(one <= largest)) largest = one;  // NaN stays
+    };
     add_largest(max_constraint_error(system, states_here, system.parameter_values(), prediction.mean), e.max_constraint_error);
     add_largest(max_constraint_error(system, states_here, parameters, prediction.mean), e.max_constraint_error_fitted);
   });
@@ -434,7 +476,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.rmse = whole.rmse();
   double normalised = 0;
   for (Index k = 0; k < e.rmse.size(); ++k) {
-    normalised += e.rmse[k] / training_spread(posterior.observations(), rows[static_cast<std::size_t>(k)]);
+    normalised += e.rmse[k] / training_spread(posterior.observations(), {}, rows[static_cast<std::size_t>(k)]);
   }
   e.rmse_normalised = normalised / static_cast<double>(rows.size());
   e.nrmse = e.rmse.norm() / spread;

@@ -42,7 +42,7 @@ struct GramGradient {
     Eigen::MatrixXd mean;     // Σ_j k_ij Z_jᵀα̃_j, the posterior mean of f_a at the samples  (N × functions)
   };
   Eigen::VectorXd alpha;      // ∂/∂ỹ = α̃ = Pỹ; where there are sums, of the rows that they are of  (size)
-  Eigen::VectorXd log_noise;  // of sums: ∂(−log p)/∂log of the noise of each, log|L| left out  (sums)
+  Eigen::VectorXd log_noise;  // of sums: ∂(−log p)/∂log of the noise of each, that of log|L| among it  (sums)
   std::vector<OfLatent> latents;
 };
 
@@ -109,12 +109,15 @@ class LatentPosterior {
   };
   struct Inverse {
     Eigen::VectorXd alpha;                // α̃
-    std::vector<Eigen::MatrixXd> blocks;  // P_ii of each sample (r × r)
+    std::vector<Eigen::MatrixXd> blocks;  // P_BB of each state, the rows of its samples one sample after another
     std::vector<WithoutSet> without;      // per set; empty where double precision cannot tell
+    Eigen::VectorXd noise = {};           // s² of each sample where local latents count as noise (theory.md, T38); empty: 1
   };
-  /// @param rows  of the observations that it is conditioned on, or of some of them, which are in `sets` as they were then
-  /// @param sets  of samples: none, or each sample in one of them
-  [[nodiscard]] virtual Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const = 0;
+  using SampleSets = std::vector<std::vector<Eigen::Index>>;
+  /// @param rows    of the observations that it is conditioned on, or of some of them, which are in `sets` as they were then
+  /// @param states  the samples of each state
+  /// @param sets    of samples: none, or each sample in one of them
+  [[nodiscard]] virtual Inverse invert(const LatentRows& rows, const SampleSets& states, const SampleSets& sets) const = 0;
 
  protected:
   LatentPosterior() = default;

@@ -159,22 +159,26 @@ InducingChoice chosen_among(const Some& some, const Prior& prior, const std::vec
   std::vector<Candidates> latents;
   for (std::size_t a = 0; a < rows.latents.size(); ++a) latents.emplace_back(rows, a, counts);
   InducingChoice choice;
-  for (;;) {
-    choice.left_out = 0;
-    Candidates* best = nullptr;
-    double largest = 0;
-    for (std::size_t a = 0; a < latents.size(); ++a) {
-      if (is_local(prior.latents[a])) continue;  // no number of points holds it
-      Candidates& latent = latents[a];
-      choice.left_out += latent.trace();
-      if (counts.size() == 0 || choice.n_variables + latent.n_functions() > options.most) continue;
-      const double part = latent.largest();
-      if (part > largest) largest = part, best = &latent;
+  // of the latents that are local or of those that are not, until they leave no more than `enough`, which is returned
+  const auto take_points = [&](bool of_local, int most, double enough) {
+    for (;;) {
+      double left_out = 0, largest = 0;
+      Candidates* best = nullptr;
+      for (std::size_t a = 0; a < latents.size(); ++a) {
+        if (is_local(prior.latents[a]) != of_local) continue;
+        Candidates& latent = latents[a];
+        left_out += latent.trace();
+        if (counts.size() == 0 || choice.n_variables + latent.n_functions() > most) continue;
+        const double part = latent.largest();
+        if (part > largest) largest = part, best = &latent;
+      }
+      if (left_out <= enough || best == nullptr) return left_out;
+      best->take();
+      choice.n_variables += static_cast<int>(best->n_functions());
     }
-    if (choice.left_out <= options.left_out || best == nullptr) break;
-    best->take();
-    choice.n_variables += static_cast<int>(best->n_functions());
-  }
+  };
+  choice.left_out = take_points(false, options.most, options.left_out);
+  take_points(true, std::min(options.most, choice.n_variables + options.of_discrepancy), 0);
   auto points = std::make_shared<InducingPoints>();
   for (const Candidates& latent : latents) points->features.push_back(latent.points());
   choice.points = std::move(points);

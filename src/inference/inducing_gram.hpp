@@ -75,7 +75,7 @@ class InducingPosterior final : public LatentPosterior {
   void erase(const std::vector<Eigen::Index>& /*samples*/) override { assert(false); }
   void forget(double share) override;
   /// @param sets  one for each stretch
-  [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const override;
+  [[nodiscard]] Inverse invert(const LatentRows& rows, const SampleSets& states, const SampleSets& sets) const override;
 
  private:
   [[nodiscard]] std::vector<Eigen::MatrixXd> latent_weights(const Eigen::Ref<const Eigen::VectorXd>& of_variables) const;

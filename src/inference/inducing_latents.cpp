@@ -6,6 +6,7 @@
 #include <Eigen/Cholesky>
 
 #include "base/lapack.hpp"
+#include "inference/potential_cross.hpp"
 #include "prior/gradient_columns.hpp"
 
 namespace gp2 {
@@ -18,33 +19,15 @@ using Eigen::VectorXd;
 
 namespace {
 
-// of the derivatives of a potential at its points, all points of one derivative after another
-MatrixXd covariance_of_gradients(const KernelColumns& points) {
-  const Index n = points.n_points(), D = points.kernel().n_features();
-  const GradientColumns columns(points);
-  GradientColumns::Workspace workspace;
-  VectorXd point;
-  MatrixXd covariance(n * D, n * D);
-  for (Index j = 0; j < n; ++j) {
-    points.scale(j, point);
-    columns.evaluate(0, n, point, workspace);
-    for (Index d = 0; d < D; ++d) {
-      columns.multiply(VectorXd::Unit(D, d), workspace);
-      covariance.col(d * n + j) = workspace.out.reshaped();
-    }
-  }
-  return covariance;
-}
-
 std::vector<lapack::PivotedFactor> factors_of(const Prior& prior, const ModelValues& values) {
   std::vector<lapack::PivotedFactor> factors;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd& Z = values.inducing->features[a];
     const Kernel& kernel = prior.latents[a].kernel;
-    lapack::PivotedFactor& factor = factors.emplace_back(lapack::factorise_semidefinite(
-        prior.latents[a].is_potential ? covariance_of_gradients(KernelColumns(kernel, Z, values.kernel[a]))
-                                      : kernel.evaluate(Z, Z, values.kernel[a]),
-        smallest_pivot));
+    lapack::PivotedFactor& factor = factors.emplace_back(
+        lapack::factorise_semidefinite(prior.latents[a].is_potential ? covariance_of_gradients(kernel, Z, values.kernel[a])
+                                                                     : kernel.evaluate(Z, Z, values.kernel[a]),
+                                       smallest_pivot));
     factor.rows.resize(static_cast<std::size_t>(factor.L.cols()));
     factor.L = factor.L.topRows(factor.L.cols()).eval();
   }

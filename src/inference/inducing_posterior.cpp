@@ -141,56 +141,73 @@ bool InducingPosterior::append(const RowBlocks& more) {
 }
 
 void InducingPosterior::forget(double share) {
-  InducingStatistics faded(inducing_);
-  faded.add(all_, share);
-  stretches_ = {std::move(faded)};
+  for (InducingStatistics& stretch : stretches_) {
+    InducingStatistics faded(inducing_);
+    faded.add(stretch, share);
+    stretch = std::move(faded);
+  }
   static_cast<void>(factorise());  // I + share (B − I) is no less definite than B
 }
 
 // With P = I − Ψ B⁻¹Ψᵀ the inverse of a set is P_BB⁻¹ = I + Ψ_B B₋⁻¹Ψ_Bᵀ, and P_BB⁻¹α̃_B = ỹ_B − Ψ_B B₋⁻¹c₋, where B₋ and c₋ are of
 // all other samples: sums of what each stretch says, so that nothing is taken from anything.
-LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) const {
+LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const SampleSets& states,
+                                                   const SampleSets& sets) const {
   const lapack::SingleThread single_thread;
   const Reduction& reduction = *rows.reduction;
   InducingBlock block(inducing_);
   block.move_to(rows);
   std::vector<MatrixXd> Psi;
   for (Index c = 0; c < reduction.n_components(); ++c) Psi.push_back(block.loadings(c));
-  // I ± Ψ_i(LLᵀ)⁻¹Ψ_iᵀ from L⁻¹Ψᵀ by component
+  // I ± Ψ_B(LLᵀ)⁻¹Ψ_Bᵀ from L⁻¹Ψᵀ by component
   const auto halves = [&](const MatrixXd& L) {
     std::vector<MatrixXd> half = Psi;
     for (MatrixXd& one : half) lapack::solve_lower(L, false, one);
     return half;
   };
   const auto rank_of = [&](Index sample) { return reduction.samples[static_cast<std::size_t>(sample)].R.rows(); };
-  const auto block_of = [&](const std::vector<MatrixXd>& half, Index i, double sign) {
-    const Index rank = rank_of(i);
-    MatrixXd square = MatrixXd::Identity(rank, rank);
-    for (Index c = 0; c < rank; ++c) {
-      for (Index d = 0; d < rank; ++d)
-        square(c, d) += sign * half[static_cast<std::size_t>(c)].col(i).dot(half[static_cast<std::size_t>(d)].col(i));
+  const auto block_of = [&](const std::vector<MatrixXd>& half, const std::vector<Index>& of, double sign) {
+    std::vector<std::pair<Index, Index>> columns;  // component and sample
+    for (const Index i : of) {
+      for (Index c = 0; c < rank_of(i); ++c) columns.emplace_back(c, i);
+    }
+    const auto column = [&](Index k) {
+      const auto [c, i] = columns[static_cast<std::size_t>(k)];
+      return half[static_cast<std::size_t>(c)].col(i);
+    };
+    MatrixXd square = MatrixXd::Identity(std::ssize(columns), std::ssize(columns));
+    for (Index k = 0; k < square.rows(); ++k) {
+      for (Index l = 0; l < square.cols(); ++l) square(k, l) += sign * column(k).dot(column(l));
     }
     return square;
   };
 
   const auto& noise = block.noise();  // s, in units of which all of this is
-  Inverse inverse{in_rows(reduction, block.misfit(mean_).array().colwise() / noise.array()), {}, {}};
+  Inverse inverse{in_rows(reduction, block.misfit(mean_).array().colwise() / noise.array()), {}, {}, noise.cwiseAbs2()};
   const std::vector<MatrixXd> half = halves(L_);
-  for (Index i = 0; i < rows.n_samples(); ++i) inverse.blocks.push_back(block_of(half, i, -1) / (noise[i] * noise[i]));
+  for (const std::vector<Index>& state : states) {
+    std::vector<double> noise_of_rows;
+    for (const Index i : state) noise_of_rows.insert(noise_of_rows.end(), static_cast<std::size_t>(rank_of(i)), noise[i]);
+    const auto s = Eigen::Map<const VectorXd>(noise_of_rows.data(), std::ssize(noise_of_rows));
+    inverse.blocks.emplace_back(block_of(half, state, -1).array() / (s * s.transpose()).array());
+  }
   for (std::size_t k = 0; k < sets.size(); ++k) {
     InducingStatistics others(inducing_);
     for (std::size_t other = 0; other < stretches_.size(); ++other) {
       if (other != k) others.add(stretches_[other]);
     }
     others.B.diagonal().array() += 1;
-    if (!lapack::factorise(others.B)) return {std::move(inverse.alpha), std::move(inverse.blocks), {}};
+    if (!lapack::factorise(others.B)) {
+      inverse.without.clear();
+      return inverse;
+    }
     lapack::solve_factored(others.B, others.c);
     const MatrixXd pull = block.misfit(others.c);
     const std::vector<MatrixXd> of_others = halves(others.B);
     WithoutSet& without = inverse.without.emplace_back();
     for (const Index sample : sets[k]) {
       without.pull.emplace_back(noise[sample] * pull.row(sample).head(rank_of(sample)));
-      without.covariance.push_back(noise[sample] * noise[sample] * block_of(of_others, sample, 1));
+      without.covariance.push_back(noise[sample] * noise[sample] * block_of(of_others, {sample}, 1));
     }
   }
   return inverse;

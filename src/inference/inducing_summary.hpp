@@ -15,6 +15,8 @@ struct KeptStates {
   std::vector<std::int64_t> n_states;        // per Observations: all that it is conditioned on
   int step = 1;                              // every so manieth is kept, a power of two
   std::vector<std::vector<int>> stretch_of;  // per Observations: the stretch of each state that is kept; empty: not known
+  /// Per Observations: as which share the likelihood of each state that is kept counts; empty: all wholly.
+  std::vector<std::vector<double>> share_of;
 };
 
 /// A posterior through inducing points but for its prior and values, as a file holds it.

@@ -517,9 +517,9 @@ const VectorXd& InverseDynamicsSolver::Workspace::missed() const {
   return require_held(implementation_, "InverseDynamicsSolver::Workspace").missed;
 }
 
-InverseDynamicsSolver::Status InverseDynamicsSolver::find(const Ref<const VectorXd>& state,
-                                                          const Ref<const VectorXd>& accelerations, Ref<VectorXd>& inputs,
-                                                          Workspace& workspace) const {
+InverseDynamicsSolver::Status InverseDynamicsSolver::inputs(const Ref<const VectorXd>& state,
+                                                            const Ref<const VectorXd>& accelerations, Ref<VectorXd> inputs,
+                                                            Workspace& workspace) const {
   const Implementation& self = implementation();
   if (!workspace.implementation_ || workspace.implementation_->solver.get() != &self) {
     throw InputError("InverseDynamicsSolver: the workspace is of another solver; use make_workspace() of this one");
@@ -537,12 +537,6 @@ InverseDynamicsSolver::Status InverseDynamicsSolver::find(const Ref<const Vector
   return status;
 }
 
-InverseDynamicsSolver::Status InverseDynamicsSolver::inputs(const Ref<const VectorXd>& state,
-                                                            const Ref<const VectorXd>& accelerations, Ref<VectorXd> inputs,
-                                                            Workspace& workspace) const {
-  return find(state, accelerations, inputs, workspace);
-}
-
 InverseDynamicsSolver::Status InverseDynamicsSolver::inputs_and_covariance(const Ref<const VectorXd>& state,
                                                                            const Ref<const VectorXd>& accelerations,
                                                                            Ref<VectorXd> inputs, Ref<MatrixXd> covariance,
@@ -550,7 +544,7 @@ InverseDynamicsSolver::Status InverseDynamicsSolver::inputs_and_covariance(const
   if (!options().covariance) throw InputError("InverseDynamicsSolver: it was made without Options::covariance");
   require_size("InverseDynamicsSolver", "a column of the covariance", covariance.rows(), implementation().nu());
   require_size("InverseDynamicsSolver", "a row of the covariance", covariance.cols(), implementation().nu());
-  const Status status = find(state, accelerations, inputs, workspace);
+  const Status status = this->inputs(state, accelerations, inputs, workspace);
   if (status != Status::ok) {
     covariance.setConstant(not_a_number);
     return status;

@@ -2,8 +2,14 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
+#include <map>
 #include <numeric>
+#include <optional>
 #include <set>
+#include <string>
+#include <tuple>
+#include <utility>
 
 #include <fmt/format.h>
 #include <Eigen/Cholesky>
@@ -32,38 +38,75 @@ std::vector<LeaveOneOut> unknown(const std::vector<Observations>& observations) 
   return out;
 }
 
-// Each value from all others.
-std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction& reduction,
-                                    const LatentPosterior::Inverse& inverse) {
-  const std::vector<Observations>& observations = posterior.observations();
-  const ModelValues& values = posterior.values();
-  std::vector<LeaveOneOut> out = unknown(observations);
-  for (std::size_t s = 0; s < reduction.samples.size(); ++s) {
-    const Reduction::Sample& sample = reduction.samples[s];
-    const Index rank = sample.R.rows();
-    VectorXd alpha(rank);
-    for (Index c = 0; c < rank; ++c)
-      alpha[c] = inverse.alpha[reduction.offset[static_cast<std::size_t>(c)] + static_cast<Index>(s)];
-    // the inverse of the covariance of all whitened values, and what it makes of theirs
-    VectorXd alpha_e = sample.Q * alpha + sample.e_out;
-    MatrixXd P_e = MatrixXd::Identity(sample.Q.rows(), sample.Q.rows()) +
-                   sample.Q * (inverse.blocks[s] - MatrixXd::Identity(rank, rank)) * sample.Q.transpose();
-    const auto g = static_cast<std::size_t>(sample.group);
-    const VectorXd noise = observations[g].noise_at(values.noise_stddev[g], sample.index);
-    if (sample.C.size() > 0) {  // from values whitened by C to those in units of σ
-      const MatrixXd to_unit = sample.C.triangularView<Eigen::Lower>().solve(
-          MatrixXd(noise.unaryExpr([](double one) { return std::isfinite(one) ? one : 1; }).asDiagonal()));
-      alpha_e = to_unit.transpose() * alpha_e;
-      P_e = to_unit.transpose() * P_e * to_unit;
-    }
-    for (Index k = 0; k < noise.size(); ++k) {
-      if (!std::isfinite(noise[k])) continue;  // not measured
-      const double p = P_e(k, k);
-      out[g].mean(k, sample.index) = observations[g].values()(k, sample.index) - noise[k] * alpha_e[k] / p;
-      out[g].variance(k, sample.index) = noise[k] * noise[k] * std::max(0.0, 1 / p - 1);
+// σ where a value is measured, else 1, on the diagonal of a matrix.
+MatrixXd diagonal_of(const VectorXd& noise) {
+  return noise.unaryExpr([](double one) { return std::isfinite(one) ? one : 1; }).asDiagonal();
+}
+
+// As which share w the likelihood of a sample counts; of less than 10⁻¹² nothing would be left beside rounding.
+double share_of(const Posterior::Implementation& self, const Reduction::Sample& sample) {
+  if (!self.kept || self.kept->share_of.empty()) return 1;
+  return std::max(1e-12, self.kept->share_of[static_cast<std::size_t>(sample.group)][static_cast<std::size_t>(sample.index)]);
+}
+
+// The samples of each state: an Observations may measure accelerations where another measures forces. What measures the same again
+// is another state.
+LatentPosterior::SampleSets samples_of_states(const std::vector<Observations>& observations, const Reduction& reduction) {
+  using Kind = std::tuple<const OtherSystem*, std::string, std::optional<int>, std::vector<int>>;
+  using Place = std::tuple<const OtherSystem*, std::vector<double>, int>;
+  std::vector<std::vector<Index>> sample_of;
+  for (const Observations& group : observations) sample_of.emplace_back(static_cast<std::size_t>(group.n_data()));
+  for (Index s = 0; s < reduction.n_samples(); ++s) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+    sample_of[static_cast<std::size_t>(sample.group)][static_cast<std::size_t>(sample.index)] = s;
+  }
+  LatentPosterior::SampleSets states;
+  std::map<Place, std::size_t> known;
+  std::map<std::pair<Kind, std::vector<double>>, int> n_before;
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const View& view = observations[g].view();
+    const OtherSystem* const system = view.other_system.get();
+    const Kind kind{system, view.quantity->word(), view.latent ? std::optional(view.latent->first) : std::nullopt, view.rows};
+    for (Index i = 0; i < observations[g].n_data(); ++i) {
+      const VectorXd state = observations[g].states().col(i).unaryExpr([](double x) { return std::isnan(x) ? HUGE_VAL : x; });
+      std::vector<double> x(state.begin(), state.end());
+      const int n = n_before[{kind, x}]++;
+      const auto [at, is_new] = known.try_emplace({system, std::move(x), n}, states.size());
+      if (is_new) states.emplace_back();
+      states[at->second].push_back(sample_of[g][static_cast<std::size_t>(i)]);
     }
   }
-  return out;
+  return states;
+}
+
+// Each value from all others.
+// @param alpha  the sample's rows of α̃
+// @param P      its block of P
+void add_values(const Posterior& posterior, const Reduction::Sample& sample, const VectorXd& alpha, const MatrixXd& P,
+                double share, double s2, std::vector<LeaveOneOut>& out) {
+  const MatrixXd identity = MatrixXd::Identity(P.rows(), P.cols());
+  // the inverse of the covariance of all whitened values, what it makes of theirs, and all that counts as noise of them
+  VectorXd alpha_e = sample.Q * alpha + sample.e_out;
+  MatrixXd P_e = MatrixXd::Identity(sample.Q.rows(), sample.Q.rows()) + sample.Q * (P - identity) * sample.Q.transpose();
+  VectorXd noise_e = 1 + (s2 - 1) * sample.Q.rowwise().squaredNorm().array();
+  const auto g = static_cast<std::size_t>(sample.group);
+  const Observations& group = posterior.observations()[g];
+  const VectorXd noise = group.noise_at(posterior.values().noise_stddev[g], sample.index);
+  if (sample.C.size() > 0) {  // from values whitened by C to those in units of σ
+    const MatrixXd to_unit = sample.C.triangularView<Eigen::Lower>().solve(diagonal_of(noise));
+    alpha_e = to_unit.transpose() * alpha_e;
+    P_e = to_unit.transpose() * P_e * to_unit;
+    const MatrixXd C = diagonal_of(noise).diagonal().cwiseInverse().asDiagonal() * sample.C;
+    noise_e = C.rowwise().squaredNorm() + (s2 - 1) * (C * sample.Q).rowwise().squaredNorm();
+  }
+  for (Index k = 0; k < noise.size(); ++k) {
+    if (!std::isfinite(noise[k])) continue;  // not measured
+    const double p = P_e(k, k);
+    out[g].mean(k, sample.index) = group.values()(k, sample.index) - noise[k] * alpha_e[k] / p;
+    // the noise that is 1/w times as large is no part of it
+    const double of_share = (1 / share - 1) * (1 / p - noise_e[k]);
+    out[g].variance(k, sample.index) = noise[k] * noise[k] * std::max(0.0, 1 / p - 1 + of_share);
+  }
 }
 
 // The samples of each stretch, which is the same share of the states of every Observations.
@@ -75,14 +118,10 @@ std::vector<std::vector<Index>> samples_of_stretches(const Posterior::Implementa
     stretch_of = self.kept->stretch_of;
   } else {
     for (const Observations& group : self.observations) {
-      std::vector<int>& of_states = stretch_of.emplace_back(static_cast<std::size_t>(group.n_data()));
-      const auto states = states_of_stretches(group, self.prior.system->layout().t(), n_stretches);
-      for (std::size_t k = 0; k < states.size(); ++k) {
-        for (const int i : states[k]) of_states[static_cast<std::size_t>(i)] = static_cast<int>(k);
-      }
+      stretch_of.push_back(stretch_of_states(states_of_stretches(group, self.prior.system->layout().t(), n_stretches)));
     }
   }
-  std::vector<std::vector<Index>> samples(static_cast<std::size_t>(n_stretches));
+  LatentPosterior::SampleSets samples(static_cast<std::size_t>(n_stretches));
   for (Index s = 0; s < reduction.n_samples(); ++s) {
     const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
     const int stretch = stretch_of[static_cast<std::size_t>(sample.group)][static_cast<std::size_t>(sample.index)];
@@ -99,8 +138,7 @@ void add_sample(const Posterior& posterior, const Reduction::Sample& sample, con
   const auto g = static_cast<std::size_t>(sample.group);
   const Observations& group = posterior.observations()[g];
   const VectorXd noise = group.noise_at(posterior.values().noise_stddev[g], sample.index);
-  MatrixXd root = sample.C;  // S^{1/2}
-  if (root.size() == 0) root = noise.unaryExpr([](double one) { return std::isfinite(one) ? one : 1; }).asDiagonal();
+  const MatrixXd root = sample.C.size() > 0 ? sample.C : diagonal_of(noise);  // S^{1/2}
   const VectorXd error = root * (sample.Q * pull + sample.e_out);
   const MatrixXd rooted = root * sample.Q;
   const MatrixXd latent = rooted * (covariance - MatrixXd::Identity(pull.size(), pull.size())) * rooted.transpose();
@@ -110,6 +148,98 @@ void add_sample(const Posterior& posterior, const Reduction::Sample& sample, con
     out[g].mean(k, sample.index) = group.values()(k, sample.index) - error[k];
     out[g].variance(k, sample.index) = std::max(0.0, latent(k, k) + slip);
   }
+}
+
+// What is said of the observations under one set of hyperparameters.
+struct OfComponent {
+  LeftOut left_out;
+  std::vector<VectorXd> log_density;  // per Observations: of all that is measured at each state, given all else; 0 of sums
+};
+
+// The reduced rows of a state. Samples that count as a share w are known as if the variance of their noise, and of what counts as
+// noise, were 1/w times as large: P = D_s⁻¹(I − D_wΨB⁻¹ΨᵀD_w)D_s⁻¹, with √w and s on the diagonals (theory.md, T37 and T38).
+struct StateRows {
+  VectorXd share, s2;  // w and s² of each
+  VectorXd alpha;      // α̃
+  MatrixXd P;
+};
+
+StateRows rows_of_state(const Posterior::Implementation& self, const Reduction& reduction,
+                        const LatentPosterior::Inverse& inverse, const std::vector<Index>& samples, const MatrixXd& block) {
+  StateRows of{VectorXd(block.rows()), VectorXd::Ones(block.rows()), inverse.alpha(rows_of_samples(reduction, samples)), block};
+  Index first = 0;
+  for (const Index s : samples) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+    of.share.segment(first, sample.R.rows()).setConstant(share_of(self, sample));
+    if (inverse.noise.size() > 0) of.s2.segment(first, sample.R.rows()).setConstant(inverse.noise[s]);
+    first += sample.R.rows();
+  }
+  if ((of.share.array() != 1).any()) {
+    const VectorXd root = of.share.cwiseSqrt();
+    of.P.array() *= (root * root.transpose()).array();
+    of.P.diagonal().array() += (1 - of.share.array()) / of.s2.array();
+  }
+  return of;
+}
+
+// The values of a state from those of other states. One value alone is left out as a value is.
+void add_row(const Posterior& posterior, const Reduction& reduction, const std::vector<Index>& samples, const StateRows& of,
+             OfComponent& out) {
+  const auto sample_of = [&](Index s) -> const Reduction::Sample& { return reduction.samples[static_cast<std::size_t>(s)]; };
+  const auto group_of = [](const Reduction::Sample& sample) { return static_cast<std::size_t>(sample.group); };
+  const Eigen::LLT<MatrixXd> factor(of.P);
+  if (factor.info() != Eigen::Success) return;
+  const VectorXd root = of.share.cwiseSqrt(), weighed = root.cwiseProduct(of.alpha), pull = factor.solve(weighed);
+  const MatrixXd covariance = factor.solve(MatrixXd::Identity(of.P.rows(), of.P.cols()));
+  double log_density = factor.matrixLLT().diagonal().array().log().sum() - 0.5 * pull.dot(weighed);
+  Index n_measured = 0;
+  for (const Index s : samples) {
+    const Reduction::Sample& sample = sample_of(s);
+    log_density -= sample.constant;
+    n_measured += posterior.observations()[group_of(sample)].values().col(sample.index).array().isFinite().count();
+  }
+  Index first = 0;
+  for (const Index s : samples) {
+    const Reduction::Sample& sample = sample_of(s);
+    const std::size_t g = group_of(sample);
+    const Index rank = sample.R.rows();
+    out.log_density[g][sample.index] = log_density;
+    LeaveOneOut& row = out.left_out.rows[g];
+    if (n_measured == 1) {
+      row.mean.col(sample.index) = out.left_out.values[g].mean.col(sample.index);
+      row.variance.col(sample.index) = out.left_out.values[g].variance.col(sample.index);
+    } else if (rank == 0) {
+      add_sample(posterior, sample, VectorXd(0), MatrixXd(0, 0), out.left_out.rows);
+    } else {
+      const double share = of.share[first], s2 = of.s2[first];
+      MatrixXd total = covariance.block(first, first, rank, rank) / share;
+      total.diagonal().array() += s2 * (1 - 1 / share);
+      add_sample(posterior, sample, pull.segment(first, rank) / root[first], total, out.left_out.rows);
+    }
+    first += rank;
+  }
+}
+
+// Of each value what all others say, and what those of other states say.
+OfComponent leave_out_states(const Posterior& posterior, const Posterior::Implementation& self, const Reduction& reduction,
+                             const LatentPosterior::Inverse& inverse, const LatentPosterior::SampleSets& states) {
+  const std::vector<Observations>& observations = posterior.observations();
+  OfComponent out{{unknown(observations), unknown(observations), {}}, {}};
+  for (const Observations& group : observations) out.log_density.emplace_back(VectorXd::Zero(group.n_data()));
+  for (std::size_t k = 0; k < states.size(); ++k) {
+    const StateRows of = rows_of_state(self, reduction, inverse, states[k], inverse.blocks[k]);
+    Index first = 0;
+    for (const Index s : states[k]) {
+      const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+      const Index rank = sample.R.rows();
+      const double share = share_of(self, sample), s2 = inverse.noise.size() > 0 ? inverse.noise[s] : 1;
+      add_values(posterior, sample, of.alpha.segment(first, rank), of.P.block(first, first, rank, rank), share, s2,
+                 out.left_out.values);
+      first += rank;
+    }
+    add_row(posterior, reduction, states[k], of, out);
+  }
+  return out;
 }
 
 // Each value from those of other stretches; empty where double precision cannot tell.
@@ -126,18 +256,11 @@ std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reductio
   return out;
 }
 
-// log of w_k, but for a constant, of one value
-double log_weight(double error, double variance) { return 0.5 * (error * error / variance + std::log(variance)); }
-
 // Of one Observations, from what each component says of it.
-// @param weigh  by w_k, each value; else all are equal
-LeaveOneOut mixed(const Posterior& posterior, std::size_t group, const std::vector<const LeaveOneOut*>& of, bool weigh) {
-  const Observations& observed = posterior.observations()[group];
+// @param log_weight  of component k, of the value of row r at state i, but for what all have
+LeaveOneOut mixed(const std::vector<const LeaveOneOut*>& of,
+                  const std::function<double(std::size_t k, Index r, Index i)>& log_weight) {
   const auto n = of.size();
-  std::vector<VectorXd> noise_stddev;
-  for (std::size_t k = 0; k < n; ++k) {
-    noise_stddev.push_back(posterior.component(static_cast<int>(k)).values().noise_stddev[group]);
-  }
   LeaveOneOut out = *of.front();
   VectorXd weight(static_cast<Index>(n)), mean(weight.size()), variance(weight.size());
   for (Index i = 0; i < out.mean.cols(); ++i) {
@@ -147,10 +270,8 @@ LeaveOneOut mixed(const Posterior& posterior, std::size_t group, const std::vect
         const auto at = static_cast<Index>(k);
         mean[at] = of[k]->mean(r, i);
         variance[at] = of[k]->variance(r, i);
-        const double noise = observed.noise_at(noise_stddev[k], static_cast<int>(i))[r];
-        weight[at] = log_weight(observed.values()(r, i) - mean[at], variance[at] + noise * noise);
+        weight[at] = log_weight(k, r, i);
       }
-      if (!weigh) weight.setZero();
       weight = (weight.array() - weight.maxCoeff()).exp();
       weight /= weight.sum();
       out.mean(r, i) = weight.dot(mean);
@@ -220,7 +341,8 @@ class WithoutSums {
   [[nodiscard]] std::vector<Prediction> predictions() const {
     std::vector<Prediction> out;
     for (const Observations& group : posterior_.observations()) {
-      const Query query = make_query(self_, group.view(), group.states());
+      Query query = make_query(self_, group.view(), group.states());
+      query.linearise_at_mean(self_);
       const std::vector<MatrixXd> loadings = query.loadings(self_);
       MatrixXd cross(self_.latents->size(), query.n_rows() * query.size());
       LatentSums(*self_.latents).evaluate(query.features, query.needed, &loadings, &cross);
@@ -236,24 +358,57 @@ class WithoutSums {
   VectorXd alpha_;
 };
 
-// under one set of hyperparameters
-LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation& self, int n_stretches) {
+OfComponent leave_out_of(const Posterior& posterior, const Posterior::Implementation& self, int n_stretches) {
   const Prior& prior = posterior.prior();
   const std::vector<Observations>& observations = posterior.observations();
   const ModelValues& values = posterior.values();
   Reduction reduction;
   reduce(prior, observations, require_models(prior, observations, values.parameters, self.about.get()), values.noise_stddev,
          reduction);
-  const std::vector<std::vector<Index>> stretches = samples_of_stretches(self, reduction, n_stretches);
-  if (reduction.sums) {
-    std::vector<std::vector<Index>> each;
+  const LatentPosterior::SampleSets states = samples_of_states(observations, reduction),
+                                    stretches = samples_of_stretches(self, reduction, n_stretches);
+  if (reduction.sums) {  // a value that only sums know goes with all sums over its state
+    LatentPosterior::SampleSets each;
     for (Index s = 0; s < reduction.n_samples(); ++s) each.push_back({s});
     const WithoutSums without(posterior, self, reduction);
-    return {without.leave_out(each), n_stretches > 0 ? without.leave_out(stretches) : std::vector<LeaveOneOut>{}};
+    std::vector<LeaveOneOut> of_samples = without.leave_out(each), of_stretches;
+    std::vector<LeaveOneOut> rows = states.size() == each.size() ? of_samples : without.leave_out(states);
+    if (n_stretches > 0) of_stretches = without.leave_out(stretches);
+    OfComponent out{{std::move(of_samples), std::move(rows), std::move(of_stretches)}, {}};
+    for (const Observations& group : observations) out.log_density.emplace_back(VectorXd::Zero(group.n_data()));
+    return out;
   }
-  const LatentPosterior::Inverse inverse = self.latents->invert(latent_rows(prior, observations, reduction, values), stretches);
-  LeftOut out{each_value(posterior, reduction, inverse), {}};
-  if (!stretches.empty()) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
+  const LatentPosterior::Inverse inverse =
+      self.latents->invert(latent_rows(prior, observations, reduction, values), states, stretches);
+  OfComponent out = leave_out_states(posterior, self, reduction, inverse, states);
+  if (!stretches.empty()) out.left_out.stretches = each_stretch(posterior, reduction, inverse, stretches);
+  return out;
+}
+
+// Of draws of the hyperparameters, given all data: those count more under which what is left out is less likely.
+LeftOut mixture_of(const Posterior& posterior, const std::vector<OfComponent>& components) {
+  LeftOut out;
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    const Observations& observed = posterior.observations()[g];
+    std::vector<const LeaveOneOut*> values, rows, stretches;
+    std::vector<MatrixXd> noise;
+    for (std::size_t k = 0; k < components.size(); ++k) {
+      const LeftOut& one = components[k].left_out;
+      values.push_back(&one.values[g]);
+      rows.push_back(&one.rows[g]);
+      if (!one.stretches.empty()) stretches.push_back(&one.stretches[g]);
+      const VectorXd stddev = posterior.component(static_cast<int>(k)).values().noise_stddev[g];
+      MatrixXd& of_values = noise.emplace_back(observed.values().rows(), observed.n_data());
+      for (int i = 0; i < observed.n_data(); ++i) of_values.col(i) = observed.noise_at(stddev, i);
+    }
+    out.values.push_back(mixed(values, [&](std::size_t k, Index r, Index i) {
+      const double error = observed.values()(r, i) - values[k]->mean(r, i);
+      const double variance = values[k]->variance(r, i) + noise[k](r, i) * noise[k](r, i);
+      return 0.5 * (error * error / variance + std::log(variance));
+    }));
+    out.rows.push_back(mixed(rows, [&](std::size_t k, Index, Index i) { return -components[k].log_density[g][i]; }));
+    if (stretches.size() == components.size()) out.stretches.push_back(mixed(stretches, [](auto...) { return 0.0; }));
+  }
   return out;
 }
 
@@ -266,25 +421,12 @@ LeftOut leave_out(const Posterior& posterior, int n_stretches) {
         fmt::format("leave_out: n_stretches must be 0 or {} through inducing points, got {}", LeftOut::n_stretches, n_stretches));
   }
   const lapack::SingleThread single_thread;
-  std::vector<LeftOut> of_components;
+  std::vector<OfComponent> components;
   for (int k = 0; k < posterior.n_components(); ++k) {
-    of_components.push_back(
+    components.push_back(
         leave_out_of(posterior.component(k), *posterior.conditioned()[static_cast<std::size_t>(k)], n_stretches));
   }
-  if (of_components.size() == 1) return std::move(of_components.front());
-  const auto all = [&](std::vector<LeaveOneOut> LeftOut::*part, bool weigh) {
-    std::vector<LeaveOneOut> out;
-    for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
-      std::vector<const LeaveOneOut*> of_group;
-      for (const LeftOut& component : of_components) {
-        if ((component.*part).empty()) return std::vector<LeaveOneOut>{};
-        of_group.push_back(&(component.*part)[g]);
-      }
-      out.push_back(mixed(posterior, g, of_group, weigh));
-    }
-    return out;
-  };
-  return {all(&LeftOut::values, true), all(&LeftOut::stretches, false)};
+  return components.size() == 1 ? std::move(components.front().left_out) : mixture_of(posterior, components);
 }
 
 std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) { return leave_out(posterior, 0).values; }

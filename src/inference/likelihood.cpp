@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "base/parallel.hpp"
+#include "gp2/error.hpp"
 #include "inference/dense_gram.hpp"
 #include "inference/inducing_gram.hpp"
 #include "inference/requirements.hpp"
@@ -58,7 +59,6 @@ struct Likelihood::Workspace::Implementation {
   std::vector<std::pair<int, int>> sample_ids;  // (group, index) of the samples in `whole`
   std::vector<MatrixXd> D;                      // per latent: R_i E_a, by component
 
-  void start(const Likelihood::Implementation& self);
   // all rows under these values; false where the mechanics have a fault
   [[nodiscard]] bool move_to(const Likelihood::Implementation& self, const ModelValues& values, bool with_derivatives);
   // null where the mechanics have a fault
@@ -69,16 +69,13 @@ struct Likelihood::Workspace::Implementation {
   void update_rows(const Likelihood::Implementation& self, const Reduction& reduction, const ModelValues& values);
 };
 
-void Likelihood::Workspace::Implementation::start(const Likelihood::Implementation& self) {
-  if (owner == self.identity) return;
-  modelled.resize(0);
-  whole = {};
-  owner = self.identity;
-}
-
 bool Likelihood::Workspace::Implementation::move_to(const Likelihood::Implementation& self, const ModelValues& values,
                                                     bool with_derivatives) {
-  start(self);
+  if (owner != self.identity) {
+    modelled.resize(0);
+    whole = {};
+    owner = self.identity;
+  }
   whole.models = models(self, values.parameters, with_derivatives);
   if (whole.models == nullptr) return false;
   whole.observations = &self.observations;
@@ -270,6 +267,9 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   const Implementation& self = implementation();
   Workspace::Implementation& work = require_held(workspace.implementation_, "Likelihood::Workspace");
   require_values(self.prior, self.observations, values);
+  if (!values.inducing && self.features.size() < self.observations.size()) {
+    throw InputError("values: the likelihood was made through inducing points, and these have none");
+  }
 
   // T10, T11: the observations under these values, and what solves for them
   std::unique_ptr<RowBlocks> blocks;

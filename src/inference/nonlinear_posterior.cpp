@@ -285,8 +285,12 @@ NonlinearMean step_to_mean(NonlinearFit& fit, const Prior& prior, const std::vec
   if (!linearisation) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   double objective = fit.objective(at, *linearisation);
   Index n_values = 0;
-  for (const Observations& group : observations) n_values += (!group.values().array().isNaN()).count() + std::ssize(group.sums());
-  const auto found = [&] { return NonlinearMean{linearisation, std::sqrt(2 * objective / static_cast<double>(n_values))}; };
+  for (const Observations& group : observations) {
+    n_values += group.has_sums() ? std::ssize(group.sums()) : (!group.values().array().isNaN()).count();
+  }
+  const auto found = [&] {
+    return NonlinearMean{linearisation, std::sqrt(2 * objective / static_cast<double>(std::max<Index>(1, n_values)))};
+  };
   const bool is_soft = std::ranges::any_of(
       observations, [&](const Observations& group) { return prior_of(prior, group.view()).system->has_constraint_noise(); });
   bool is_in_kink = false;

@@ -34,8 +34,7 @@ Linearisation::OfGroup columns(const Linearisation::OfGroup& of, const Which& wh
 }
 
 ObservationModel::Values zero_like(ObservationModel::Values values) {
-  values.view.matrix.setZero();
-  values.view.offset.setZero();
+  for (MatrixXd* of_view : {&values.view.matrix, &values.view.offset, &values.view.slip}) of_view->setZero();
   values.prior.mean.setZero();
   for (MatrixXd& E : values.prior.directions) E.setZero();
   return values;

@@ -42,16 +42,15 @@ LatentPath draw_prior_path(const Posterior::Implementation& posterior, std::size
 MatrixXd evaluate_prior_path(const LatentPath& path, const LatentPosterior::Basis& basis) {
   const KernelColumns& kernel = basis.kernel;
   MatrixXd f(basis.n_functions, kernel.n_points());
-  if (basis.is_potential) {
-    for (Index j = 0; j < kernel.n_points(); ++j) {
-      f.col(j) = path.features.gradient(path.weights.col(0), kernel.features().row(j).transpose());
-    }
-    return f;
-  }
   VectorXd psi(path.features.size());
   for (Index j = 0; j < kernel.n_points(); ++j) {
-    path.features.evaluate(kernel.features().row(j).transpose(), psi);
-    f.col(j) = path.weights.transpose() * psi;
+    const auto features = kernel.features().row(j).transpose();
+    if (basis.is_potential) {
+      f.col(j) = path.features.gradient(path.weights.col(0), features);
+    } else {
+      path.features.evaluate(features, psi);
+      f.col(j) = path.weights.transpose() * psi;
+    }
   }
   return f;
 }

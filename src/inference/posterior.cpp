@@ -17,7 +17,6 @@
 #include "inference/query.hpp"
 #include "inference/requirements.hpp"
 #include "prior/gradient_columns.hpp"
-#include "prior/padded_rows.hpp"
 
 namespace gp2 {
 
@@ -38,14 +37,8 @@ void Posterior::Implementation::add_samples(const std::vector<Observations>& gro
   Reduction reduction;
   reduce(prior, groups, require_models(prior, groups, values.parameters, about.get()), noise_stddev, reduction);
   const RowBlock block{latent_rows(prior, groups, reduction, values)};
-  bool is_positive_definite = true;
-  if (latents) {
-    is_positive_definite = latents->append(WholeRows(block));
-  } else {
-    latents = DensePosterior::condition(block.rows);
-    is_positive_definite = latents != nullptr;
-  }
-  if (!is_positive_definite) throw_not_definite();
+  if (!latents) latents = std::make_shared<DensePosterior>(block.rows);
+  if (!latents->append(WholeRows(block))) throw_not_definite();
 
   std::vector<std::int64_t> number{next_number};  // of the first sample of each group
   for (const Observations& group : groups) number.push_back(number.back() + group.n_data());
@@ -54,11 +47,6 @@ void Posterior::Implementation::add_samples(const std::vector<Observations>& gro
     const std::size_t group = static_cast<std::size_t>(sample.group);
     samples.push_back({first_group + sample.group, number[group] + sample.index, sample.constant});
   }
-}
-
-void Posterior::Implementation::erase_samples(const std::vector<Index>& gone) {
-  latents->erase(gone);
-  samples.resize(static_cast<std::size_t>(close_gaps(samples.data(), static_cast<Index>(samples.size()), gone)));
 }
 
 Posterior::Implementation::Implementation(Prior of, std::vector<Observations> observed, ModelValues under)
@@ -127,10 +115,6 @@ void add_prior_covariance(double k, const double* left, const double* right, Ind
   covariance.noalias() += k * l.transpose().lazyProduct(r);
 }
 
-}  // namespace
-
-namespace {
-
 MatrixXd mean_of(const Posterior::Implementation& self, const View& view, const Ref<const MatrixXd>& states, int n_threads) {
   require_query(self, view, states);
   constexpr Index block_size = 256;
@@ -153,16 +137,10 @@ MatrixXd mean_of(const Posterior::Implementation& self, const View& view, const 
 }  // namespace
 
 MatrixXd Posterior::mean(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
-  MatrixXd mean;
-  for (const auto& component : conditioned()) {
-    MatrixXd one = mean_of(*component, view, states, n_threads);
-    if (mean.size() == 0) {
-      mean = std::move(one);
-    } else {
-      mean += one;
-    }
-  }
-  if (components_.size() > 1) mean /= static_cast<double>(components_.size());
+  const Components& components = conditioned();
+  MatrixXd mean = mean_of(*components.front(), view, states, n_threads);
+  for (std::size_t k = 1; k < components.size(); ++k) mean += mean_of(*components[k], view, states, n_threads);
+  if (components.size() > 1) mean /= static_cast<double>(components.size());
   return mean;
 }
 
@@ -177,10 +155,7 @@ class MarginalBlock {
   int evaluate(const View& view, const Ref<const MatrixXd>& states, Index first, Index n, Posterior::Marginal& marginal,
                Index column) {
     query_.evaluate(posterior_, view, states, first, n);
-    if (posterior_.prior.is_nonlinear()) {
-      sums_.evaluate(query_.features, query_.needed);
-      query_.linearise(posterior_, sums_.mean());
-    }
+    query_.linearise_at_mean(posterior_);
     const Query::Fewer fewer = query_.fewer_loadings(posterior_);
     const Index d = view.size(), r = fewer.n_rows;
     cross_.resize(posterior_.latents->size(), r * n);
@@ -248,10 +223,6 @@ class MarginalBlock {
   KernelColumns::Workspace workspace_;
 };
 
-}  // namespace
-
-namespace {
-
 // Mean and covariance of a mixture of equal weights (theory.md, T31); of one component they are its own.
 template <typename Gaussian, typename AddSquare>
 Gaussian mixed(std::vector<Gaussian> components, const AddSquare& add_square) {
@@ -292,13 +263,18 @@ Posterior::Marginal mixed_marginal(const std::vector<std::shared_ptr<const Poste
                                    const View& view, const Ref<const MatrixXd>& states, Index first, Index n, int n_threads) {
   const lapack::SingleThread single_thread;
   std::vector<Posterior::Marginal> of_components;
-  for (const auto& component : components) of_components.push_back(marginal_of(*component, view, states, first, n, n_threads));
+  int n_clipped = 0;
+  for (const auto& component : components) {
+    n_clipped += of_components.emplace_back(marginal_of(*component, view, states, first, n, n_threads)).n_clipped;
+  }
   const Index d = view.size();
-  return mixed(std::move(of_components), [d](MatrixXd& covariance, const MatrixXd& deviation) {
+  Posterior::Marginal marginal = mixed(std::move(of_components), [d](MatrixXd& covariance, const MatrixXd& deviation) {
     for (Index i = 0; i < deviation.cols(); ++i) {
       Map<MatrixXd>(covariance.col(i).data(), d, d) += deviation.col(i) * deviation.col(i).transpose();
     }
   });
+  marginal.n_clipped = n_clipped;
+  return marginal;
 }
 
 }  // namespace
@@ -326,12 +302,13 @@ VectorXd Posterior::distance_from_data(const View& view, const Ref<const MatrixX
   const Implementation& self = implementation();
   require_query(self, view, states);
   const DataDistance distance(self, view);
+  const Prior& there = prior_of(self.prior, view);
   constexpr Index block_size = 64;
   VectorXd distances(states.cols());
   for_each_block(states.cols(), block_size, thread_count(n_threads), [&](Index first, Index n, int) {
-    std::vector<MatrixXd> features(self.prior.latents.size());
+    std::vector<MatrixXd> features(there.latents.size());
     for (std::size_t a = 0; a < features.size(); ++a) {
-      if (view.has_latent(a)) features[a] = features_of_block(self.prior, a, states, first, n).transpose();
+      if (view.has_latent(a)) features[a] = features_of_block(there, a, states, first, n).transpose();
     }
     VectorXd z(distance.n_coordinates());
     for (Index i = 0; i < n; ++i) {
@@ -387,10 +364,6 @@ void add_prior_covariance(const Posterior::Implementation& self, const Query& le
   }
 }
 
-}  // namespace
-
-namespace {
-
 Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vector<ViewAt>& quantities) {
   std::vector<Query> queries;
   std::vector<std::vector<MatrixXd>> loadings;
@@ -398,11 +371,7 @@ Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vect
   Index size = 0;
   for (const ViewAt& quantity : quantities) {
     Query& query = queries.emplace_back(make_query(self, quantity.view, quantity.states));
-    if (self.prior.is_nonlinear()) {
-      LatentSums mean(*self.latents);
-      mean.evaluate(query.features, query.needed);
-      query.linearise(self, mean.mean());
-    }
+    query.linearise_at_mean(self);
     loadings.push_back(query.loadings(self));
     first.push_back(size);
     size += query.n_rows() * query.size();

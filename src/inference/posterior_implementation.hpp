@@ -30,7 +30,7 @@ struct Posterior::Implementation {
   ModelValues values;
   std::vector<Eigen::MatrixXd> C;            // per latent: loading (p × F)
   std::vector<Sample> samples;               // in the order of adding to `latents`; none through inducing points
-  std::shared_ptr<LatentPosterior> latents;  // not shared: see own_implementation
+  std::shared_ptr<LatentPosterior> latents;  // not shared: see own_components
   std::int64_t next_number = 0;
   std::shared_ptr<std::once_flag> conditioning;  // of a lazy posterior: whether `latents` stand; null: they do
   std::size_t n_given_groups = 0;                // of `observations`, that the constructor was given: the first ones
@@ -53,10 +53,10 @@ struct Posterior::Implementation {
   /// is linearised at the posterior mean of all; what was there stays as it was.
   void condition_through_points(const Workers& workers);
   void add_through_points(const Observations& more, std::size_t group);
+  /// Lets the likelihood of all observations count as its power `share`, through inducing points.
+  void forget(double share);
   /// Sets `about` for the observations that are here, of a nonlinear prior through points.
   void linearise_kept(const Workers& workers);
-  /// Takes samples away, at rising indices; `observations` stay as they are.
-  void erase_samples(const std::vector<Eigen::Index>& gone);
   /// Groups without states go, but for those that the constructor was given.
   void erase_empty_groups();
 };

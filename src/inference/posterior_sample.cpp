@@ -8,8 +8,8 @@
 #include "gp2/error.hpp"
 #include "gp2/posterior.hpp"
 #include "inference/latent_sums.hpp"
+#include "inference/potential_cross.hpp"
 #include "inference/query.hpp"
-#include "prior/gradient_columns.hpp"
 
 // Samples of a posterior at given states.
 namespace gp2 {
@@ -61,25 +61,6 @@ struct LatentGaussian {
   MatrixXd covariance;
 };
 
-// of the gradient of a potential at the points, function by function
-MatrixXd potential_covariance(const Posterior::Implementation& self, std::size_t a, const MatrixXd& features) {
-  const KernelColumns points(self.prior.latents[a].kernel, features, self.values.kernel[a]);
-  const GradientColumns columns(points);
-  GradientColumns::Workspace w;
-  const Index n = features.rows(), D = features.cols();
-  MatrixXd covariance(n * D, n * D);
-  VectorXd point;
-  for (Index j = 0; j < n; ++j) {
-    points.scale(j, point);
-    columns.evaluate(0, n, point, w);
-    for (Index l = 0; l < D; ++l) {
-      columns.multiply(VectorXd::Unit(D, l), w);
-      covariance.col(l * n + j) = w.out.reshaped();
-    }
-  }
-  return covariance;
-}
-
 // the posterior of every latent function at the points
 LatentGaussian latent_posterior(const Posterior::Implementation& self, const LatentPoints& points) {
   LatentGaussian out{VectorXd::Zero(points.size), MatrixXd::Zero(points.size, points.size)};
@@ -95,7 +76,8 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
     MatrixXd k;
     if (self.prior.latents[a].is_potential) {
       const Index all = n_functions * n_points;
-      out.covariance.block(points.first[a], points.first[a], all, all) = potential_covariance(self, a, points.features[a]);
+      out.covariance.block(points.first[a], points.first[a], all, all) =
+          covariance_of_gradients(self.prior.latents[a].kernel, points.features[a], self.values.kernel[a]);
     } else {
       k = self.prior.latents[a].kernel.evaluate(points.features[a], points.features[a], self.values.kernel[a]);
     }
@@ -217,6 +199,7 @@ std::vector<std::vector<Index>> samples_of_components(int n_components, int n_sa
 }
 
 MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples, std::uint64_t seed) const {
+  if (n_samples < 0) throw InputError(fmt::format("Posterior::sample: n_samples must not be negative, got {}", n_samples));
   const lapack::SingleThread single_thread;
   const std::vector<std::vector<Index>> samples_of = samples_of_components(n_components(), n_samples, seed);
   MatrixXd samples;

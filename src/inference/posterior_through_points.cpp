@@ -28,19 +28,26 @@ InducingStatistics require_statistics(const Prior& prior, const std::vector<Obse
   return *std::move(statistics);
 }
 
+// Of each state, in every Observations: those of every second state stay.
+template <typename Value>
+void keep_every_second(std::vector<std::vector<Value>>& of_states) {
+  for (std::vector<Value>& values : of_states) {
+    for (std::size_t k = 0; 2 * k < values.size(); ++k) values[k] = values[2 * k];
+    values.resize((values.size() + 1) / 2);
+  }
+}
+
 // Every second of the states that are kept, until they are few.
 void keep_some(std::vector<Observations>& observations, KeptStates& kept) {
   while (n_states(observations) > KeptStates::most) {
     kept.step *= 2;
-    for (std::size_t g = 0; g < observations.size(); ++g) {
-      std::vector<int> states, stretch_of;
-      for (int i = 0; i < observations[g].n_data(); i += 2) {
-        states.push_back(i);
-        if (!kept.stretch_of.empty()) stretch_of.push_back(kept.stretch_of[g][static_cast<std::size_t>(i)]);
-      }
-      observations[g] = observations[g].take(states);
-      if (!kept.stretch_of.empty()) kept.stretch_of[g] = std::move(stretch_of);
+    for (Observations& group : observations) {
+      std::vector<int> states;
+      for (int i = 0; i < group.n_data(); i += 2) states.push_back(i);
+      group = group.take(states);
     }
+    keep_every_second(kept.stretch_of);
+    keep_every_second(kept.share_of);
   }
 }
 
@@ -55,10 +62,7 @@ void Posterior::Implementation::condition_through_points(const Workers& workers)
   for (const Observations& group : observations) {
     all.n_states.push_back(group.n_data());
     states.push_back(states_of_stretches(group, prior.system->layout().t(), n_stretches));
-    std::vector<int>& stretch_of = all.stretch_of.emplace_back(static_cast<std::size_t>(group.n_data()));
-    for (std::size_t k = 0; k < n_stretches; ++k) {
-      for (const int i : states.back()[k]) stretch_of[static_cast<std::size_t>(i)] = static_cast<int>(k);
-    }
+    all.stretch_of.push_back(stretch_of_states(states.back()));
   }
   InducingLatents inducing(prior, values);
   std::vector<InducingStatistics> stretches;
@@ -78,6 +82,18 @@ void Posterior::Implementation::condition_through_points(const Workers& workers)
   kept = std::move(all);
   keep_some(observations, *kept);
   linearise_kept(workers);
+}
+
+void Posterior::Implementation::forget(double share) {
+  latents->forget(share);
+  std::vector<std::vector<double>>& shares = kept->share_of;
+  if (shares.empty()) {
+    for (const Observations& group : observations) shares.emplace_back(static_cast<std::size_t>(group.n_data()), 1);
+  }
+  for (std::vector<double>& of_group : shares) {
+    for (double& one : of_group) one *= share;
+  }
+  linearise_kept(1);
 }
 
 void Posterior::Implementation::linearise_kept(const Workers& workers) {
@@ -134,6 +150,10 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
   for (int i = 0; i < more.n_data(); ++i, ++n_states) {
     if (n_states % kept->step == 0) states.push_back(i);
   }
+  if (!kept->share_of.empty()) {
+    kept->share_of.resize(kept->n_states.size());
+    kept->share_of[group].insert(kept->share_of[group].end(), states.size(), 1);
+  }
   if (is_new) {
     observations.push_back(more.take(states));
     values.noise_stddev.push_back(more.noise().stddev());
@@ -168,6 +188,7 @@ std::shared_ptr<const InducingSummary> Posterior::summary() const {
   if (!held().front()->kept) return nullptr;
   auto summary = std::make_shared<InducingSummary>();
   summary->kept = *held().front()->kept;
+  summary->kept.stretch_of.clear();  // its sums are of all stretches together
   for (const auto& component : held()) {
     const auto& through = static_cast<const InducingPosterior&>(*component->latents);
     summary->components.push_back({through.inducing(), through.all()});

@@ -10,6 +10,7 @@
 #include "gp2/posterior.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/requirements.hpp"
+#include "prior/padded_rows.hpp"
 
 // Posteriors that grow and shrink with their data.
 namespace gp2 {
@@ -30,6 +31,8 @@ void condition_anew(Posterior::Implementation& self) {
   std::vector<std::pair<int, std::int64_t>> numbers;
   for (const Posterior::Implementation::Sample& sample : self.samples) numbers.emplace_back(sample.group, sample.number);
   std::ranges::sort(numbers);
+  self.latents = nullptr;
+  self.about = nullptr;
   self.condition(1);
   for (Posterior::Implementation::Sample& sample : self.samples) {
     sample.number = numbers[static_cast<std::size_t>(sample.number)].second;
@@ -86,11 +89,8 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
   // in each group the oldest stand first
   std::vector<int> n_gone(self.observations.size());
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self.samples[static_cast<std::size_t>(sample)].group)];
-  if (self.prior.is_nonlinear()) {
-    for (auto sample = gone.rbegin(); sample != gone.rend(); ++sample) self.samples.erase(self.samples.begin() + *sample);
-  } else {
-    self.erase_samples(gone);
-  }
+  self.samples.resize(static_cast<std::size_t>(close_gaps(self.samples.data(), std::ssize(self.samples), gone)));
+  if (!self.prior.is_nonlinear()) self.latents->erase(gone);
   for (std::size_t group = 0; group < n_gone.size(); ++group) self.observations[group].remove_first(n_gone[group]);
   self.erase_empty_groups();
   if (self.prior.is_nonlinear()) condition_anew(self);
@@ -116,6 +116,7 @@ std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_component
 
 Posterior update(Posterior&& posterior, Observations added) {
   require_observations(posterior.prior(), added);
+  require_learnable(posterior.prior(), {added});
   added.require_no_sums();
   if (added.n_data() == 0) return std::move(posterior);
   const lapack::SingleThread single_thread;
@@ -133,10 +134,7 @@ Posterior forget(Posterior&& posterior, double share) {
   }
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
-  for (const auto& component : own) {
-    component->latents->forget(share);
-    component->linearise_kept(1);
-  }
+  for (const auto& component : own) component->forget(share);
   posterior.components_.clear();
   return Posterior(Posterior::Components(own.begin(), own.end()));
 }

@@ -27,6 +27,24 @@ void require_potential(const Prior& prior, int latent) {
   throw InputError(fmt::format("potential: the latent '{}' is none; write directions = \"potential\" in the model", of.name));
 }
 
+MatrixXd covariance_of_gradients(const Kernel& kernel, const MatrixXd& features, const VectorXd& values) {
+  const KernelColumns points(kernel, features, values);
+  const GradientColumns columns(points);
+  GradientColumns::Workspace w;
+  const Index n = features.rows(), D = features.cols();
+  MatrixXd covariance(n * D, n * D);
+  VectorXd point;
+  for (Index j = 0; j < n; ++j) {
+    points.scale(j, point);
+    columns.evaluate(0, n, point, w);
+    for (Index d = 0; d < D; ++d) {
+      columns.multiply(VectorXd::Unit(D, d), w);
+      covariance.col(d * n + j) = w.out.reshaped();
+    }
+  }
+  return covariance;
+}
+
 PotentialCross::PotentialCross(const LatentPosterior::Basis& basis, const MatrixXd& features, const VectorXd& reference)
     : basis_(basis), features_(features) {
   of_reference_ = at(reference);

@@ -28,6 +28,11 @@ class PotentialCross {
   GradientColumns::Workspace workspace_;
 };
 
+/// cov(∇V, ∇V) at points, of a potential of signal 1: all points of one derivative after another (D·N × D·N).
+/// @param features  (N × D)
+/// @param values    of the kernel's parameters
+Eigen::MatrixXd covariance_of_gradients(const Kernel& kernel, const Eigen::MatrixXd& features, const Eigen::VectorXd& values);
+
 /// @throws InputError when the prior has no such latent, or it is no potential.
 void require_potential(const Prior& prior, int latent);
 

@@ -43,7 +43,7 @@ Index n_functions(const std::vector<PredictorTerm>& terms) {
 template <typename T>
 void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector<PredictorTerm>& terms, bool stddev) {
   row_of_ = posterior.row_of();
-  n_samples_ = row_of_.empty() ? 0 : static_cast<Index>(row_of_.front().size());
+  n_samples_ = posterior.latents().empty() ? 0 : posterior.latents().front().kernel.n_points();
   reduced_size_ = posterior.size();
   if (posterior.sums() != nullptr) sums_ = posterior.sums()->D.cast<T>();
   for (const PredictorTerm& term : terms) {
@@ -91,7 +91,7 @@ typename PredictorData<T>::Memory PredictorData<T>::make_memory(const std::vecto
   for (const PredictorTerm& term : terms) {
     const Index D = term.kernel.features().cols(), p = term.size();
     memory.point.setZero(std::max(memory.point.size(), D));
-    widest = std::max({widest, D * p, term.n_functions()});
+    widest = std::max({widest, D * p, p, term.n_functions()});
     memory.gradients.emplace_back();
     if (term.is_potential) {
       reserve_gradient(term, memory);
@@ -211,12 +211,6 @@ void PredictorData<T>::differentiate_signal(const PredictorTerm& term, std::size
   }
 }
 
-// whether the covariance is kept with each latent function, where those are fewer than the rows of the view
-template <typename T>
-bool PredictorData<T>::is_by_function(const std::vector<PredictorTerm>& terms, Index n_rows) const {
-  return n_functions(terms) < n_rows;
-}
-
 // memory.products += k_a Σ_f Z_f loading_f, n functions of a latent from the first
 template <typename T>
 void PredictorData<T>::add_products(const PredictorTerm& term, std::size_t a, std::size_t component, Index first, Index n,
@@ -318,7 +312,8 @@ template <typename T>
 void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& terms, const std::vector<MatrixXd>& loadings,
                                           Memory& memory, MatrixXd& covariance) const {
   const Index d = covariance.rows();
-  const bool by_function = is_by_function(terms, d);
+  // the covariance is with each latent function where those are fewer than the rows of the view
+  const bool by_function = n_functions(terms) < d;
   if (by_function) {
     write_cross_of_functions(terms, memory);
   } else {

@@ -79,7 +79,6 @@ class PredictorData {
   void whiten(Eigen::Index i, const T* row, Memory& memory) const;
   void evaluate_kernel(const PredictorTerm& term, std::size_t a, const Eigen::VectorXd& point, Memory& memory, T* k) const;
   void move_point(const LatentData& data, const Eigen::VectorXd& point, Memory& memory) const;
-  [[nodiscard]] bool is_by_function(const std::vector<PredictorTerm>& terms, Eigen::Index n_rows) const;
   void add_products(const PredictorTerm& term, std::size_t a, std::size_t component, Eigen::Index first, Eigen::Index n,
                     const T* loading, Memory& memory) const;
   void scatter(std::size_t component, Eigen::Index column, Memory& memory) const;

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "gp2/error.hpp"
+#include "inference/latent_sums.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/pivoted_qr.hpp"
 
@@ -23,7 +24,10 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   // the error counts the state among all, and what is rounding is judged over all
   if (mechanics.fault) static_cast<void>(require_mechanics(there, viewed, states, parameters));
   view = evaluate_view(viewed, mechanics, block);
-  prior = require_prior_values(there, block, parameters, mechanics);
+  prior = evaluate_prior(there, block, parameters, mechanics);
+  if (prior.fault) {
+    static_cast<void>(require_prior_values(there, states, parameters, require_mechanics(there, viewed, states, parameters)));
+  }
   needed = there.is_nonlinear() ? std::nullopt : viewed.latent;
   nonlinear_.reset();
   if (there.is_nonlinear()) {
@@ -62,6 +66,13 @@ void Query::linearise(const Posterior::Implementation& posterior, const std::vec
   if (!fault) return;
   throw InputError(internal::describe_fault(*prior_of(posterior.prior, nonlinear_->of).system, nonlinear_->motion->states(),
                                             *fault, nonlinear_->first));
+}
+
+void Query::linearise_at_mean(const Posterior::Implementation& posterior) {
+  if (!nonlinear_) return;
+  LatentSums sums(*posterior.latents);
+  sums.evaluate(features, needed);
+  linearise(posterior, sums.mean());
 }
 
 void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {

@@ -32,6 +32,8 @@ struct Query {
   /// below; of another prior it does nothing.
   /// @throws InputError where a state has no motion under them
   void linearise(const Posterior::Implementation& posterior, const std::vector<Eigen::MatrixXd>& f);
+  /// The same about the posterior mean of f_a.
+  void linearise_at_mean(const Posterior::Implementation& posterior);
 
   /// v at every state, given f_a there, per latent (F × n).
   void view_of(const Posterior::Implementation& posterior, const std::vector<Eigen::MatrixXd>& f,

@@ -6,6 +6,7 @@
 
 #include <Eigen/QR>
 
+#include "data/evenly.hpp"
 #include "mechanics/pivoted_qr.hpp"
 
 namespace gp2 {
@@ -279,9 +280,7 @@ std::vector<Index> rows_of_samples(const Reduction& reduction, const std::vector
 
 void reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
             const std::vector<VectorXd>& noise_stddev, Reduction& reduction) {
-  std::size_t n_samples = 0;
-  for (const Observations& group : observations) n_samples += static_cast<std::size_t>(group.n_data());
-  reduction.samples.resize(n_samples);
+  reduction.samples.resize(static_cast<std::size_t>(n_states(observations)));
   reduction.n = std::ssize(reduction.samples);
   reduction.constant = 0;
   Split split;
@@ -304,9 +303,7 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
   sort_by_rank(reduction);
   stack(prior, models, reduction);
   reduction.sums.reset();
-  if (std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.has_sums(); })) {
-    sum_up(observations, noise_stddev, reduction);
-  }
+  if (has_sums(observations)) sum_up(observations, noise_stddev, reduction);
   reduction.same_directions.clear();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     reduction.same_directions.push_back(has_same_directions(prior.latents[a], reduction, reduction.directions[a]));

@@ -14,8 +14,9 @@ std::size_t BlocksOfStates::Kept::bytes() const {
   Index n = reduction ? reduction->y.size() : 0;
   for (const Eigen::MatrixXd& one : features) n += one.size();
   for (const ObservationModel& model : models) {
-    n += model.values.view.matrix.size() + model.values.view.offset.size() + model.values.prior.mean.size();
-    for (const Eigen::MatrixXd& one : model.values.prior.directions) n += one.size();
+    const auto& [view, prior] = model.values;
+    n += view.matrix.size() + view.offset.size() + view.slip.size() + prior.mean.size();
+    for (const Eigen::MatrixXd& one : prior.directions) n += one.size();
   }
   if (reduction) {
     for (const Eigen::MatrixXd& one : reduction->directions) n += one.size();

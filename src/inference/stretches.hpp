@@ -21,4 +21,15 @@ inline std::vector<std::vector<int>> states_of_stretches(const Observations& gro
   return stretches;
 }
 
+/// The stretch of each state.
+inline std::vector<int> stretch_of_states(const std::vector<std::vector<int>>& stretches) {
+  std::size_t n = 0;
+  for (const std::vector<int>& states : stretches) n += states.size();
+  std::vector<int> stretch_of(n);
+  for (std::size_t k = 0; k < stretches.size(); ++k) {
+    for (const int i : stretches[k]) stretch_of[static_cast<std::size_t>(i)] = static_cast<int>(k);
+  }
+  return stretch_of;
+}
+
 }  // namespace gp2

@@ -32,7 +32,7 @@ class ThinnedProblem {
  public:
   ThinnedProblem(const FitProblem& problem, const FitOptions& options) : problem_(problem) {
     const int size = fit_memory(problem, options).reduced_size;
-    const int every = (size + largest_actuator_size - 1) / largest_actuator_size;
+    const int every = std::max(1, (size + largest_actuator_size - 1) / largest_actuator_size);
     const std::vector<Observations> trusted = problem.robust ? without_gross_errors(problem.observations) : problem.observations;
     for (std::size_t g = 0; g < trusted.size(); ++g) {
       std::vector<int> rows;

@@ -5,7 +5,6 @@
 #include <iterator>
 #include <mutex>
 #include <numbers>
-#include <set>
 #include <tuple>
 #include <utility>
 
@@ -128,7 +127,8 @@ class LoadCheck {
         values_(evaluate_prior(prior_, states_, parameters_, mechanics_)) {}
 
   void run(std::vector<Finding>& findings) const {
-    add_shares(findings);
+    for (std::string& text : shared_load_texts(model_, *prior_.system, mechanics_))
+      findings.push_back({Level::warning, std::move(text)});
     if (values_.fault) {
       const Eigen::Index row = rows_[static_cast<std::size_t>(values_.fault->state)];
       findings.push_back({Level::error, fmt::format("{} at state {}", values_.fault->text, row + 1)});
@@ -160,40 +160,6 @@ class LoadCheck {
 
   static bool reads_load(const StateFunction& function, const Eigen::VectorXd& parameters) {
     return function.make_evaluator(parameters)->tapes().n_loads > 0;
-  }
-
-  // rows whose multipliers latents read, and which follow from others: which share of the load is theirs is a choice
-  void add_shares(std::vector<Finding>& findings) const {
-    constexpr double rounding = 1e-6;
-    const System& system = *prior_.system;
-    std::set<std::string> read;
-    for (const LatentSpec& latent : model_.latents) {
-      const auto add = [&](const std::string& text) {
-        for (const std::string& variable : model_.graph->variables_of(model_.expression(text))) read.insert(variable);
-      };
-      if (!latent.feature_code) std::for_each(latent.features.begin(), latent.features.end(), add);
-      if (latent.direction_code) continue;
-      for (const std::vector<std::string>& row : latent.directions) std::for_each(row.begin(), row.end(), add);
-    }
-    std::vector<bool> is_shared(static_cast<std::size_t>(system.nc()), false);
-    for (int i = 0; i < states_.cols(); ++i) {
-      const auto A = mechanics_.values.A(i);
-      // the identity of independent rows
-      const Eigen::MatrixXd shares = mechanics_.projections[static_cast<std::size_t>(i)].multipliers_of_force() * A.transpose();
-      for (int row = 0; row < system.nc(); ++row)
-        if (!A.row(row).isZero(0) && shares(row, row) < 1 - rounding) is_shared[static_cast<std::size_t>(row)] = true;
-    }
-    for (int row = 0; row < system.nc(); ++row) {
-      for (const char* name : {"lambda0", "lambda"}) {
-        const std::string variable = fmt::format("{}({})", name, row + 1);
-        if (!is_shared[static_cast<std::size_t>(row)] || !read.contains(variable)) continue;
-        findings.push_back(
-            {Level::warning,
-             fmt::format("{}: the constraint '{}' follows from others, so that nothing tells its share of the load: "
-                         "remove the rows that repeat others",
-                         variable, system.constraint_labels()[static_cast<std::size_t>(row)])});
-      }
-    }
   }
 
   // how much of the load under the known force a coefficient of 1 changes (theory.md, T46: κ)
@@ -245,23 +211,30 @@ class LoadCheck {
   PriorValues values_;
 };
 
-void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
-  constexpr Eigen::Index enough = 300;  // states, evenly taken
+// Directions of latents, at the states that are known.
+void check_latents(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
+  constexpr Eigen::Index enough = 300;  // states, evenly taken, for what is sought at each
   PriorOptions options;
   options.mean = Prior::Mean::force;
   const Prior prior = make_prior(model, options);
   const Eigen::VectorXd parameters = prior.system->parameter_values();
-  if (std::ranges::none_of(prior.latents, [&](const Latent& one) { return LoadCheck::reads_load(one, parameters); })) return;
   const std::vector<bool> reads = prior.reads();
   std::vector<Eigen::Index> rows;
-  for (Eigen::Index i = 0; i < states.cols(); i += std::max<Eigen::Index>(1, states.cols() / enough)) {
+  for (Eigen::Index i = 0; i < states.cols(); ++i) {
     bool is_known = true;
     for (std::size_t k = 0; k < reads.size(); ++k)
       is_known = is_known && !(reads[k] && std::isnan(states(static_cast<Eigen::Index>(k), i)));
     if (is_known) rows.push_back(i);
   }
-  if (rows.empty()) return;
-  LoadCheck(model, prior, states(Eigen::all, rows), rows).run(findings);
+  ActingStates acting(prior);
+  acting.count(prior, states(Eigen::all, rows), parameters);
+  for (std::string& text : acting.idle_texts()) findings.push_back({Level::warning, std::move(text)});
+  if (std::ranges::none_of(prior.latents, [&](const Latent& one) { return LoadCheck::reads_load(one, parameters); })) return;
+  const auto stride = std::max<Eigen::Index>(1, std::ssize(rows) / enough);
+  std::vector<Eigen::Index> some;
+  for (Eigen::Index k = 0; k < std::ssize(rows); k += stride) some.push_back(rows[static_cast<std::size_t>(k)]);
+  if (some.empty()) return;
+  LoadCheck(model, prior, states(Eigen::all, some), some).run(findings);
 }
 
 // The system, and where that is sound what the prior asks of it.
@@ -273,7 +246,7 @@ void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vec
   const View view = View::constrained_acceleration(system);
   const int singular = what_needs_acceleration(prior, view) ? first_singular_mass(system, states) : -1;
   if (singular < 0) {
-    check_load(model, states, findings);
+    check_latents(model, states, findings);
     return;
   }
   MechanicsBatch mechanics;
@@ -331,9 +304,10 @@ void check_turns(const WholeLog& log, const System& system, int j, std::vector<F
   if (forth == 0 || back == 0 || static_cast<double>(forth + back) < often * static_cast<double>(n)) return;
   findings.push_back(
       {Level::warning,
-       fmt::format("{} moves by more than half a turn from row to row, forth and back, at {} of {} rows, over a range "
-                   "of {:.3g}: is it in rad, and sampled often enough?",
-                   system.coordinates()[static_cast<std::size_t>(j)].name, forth + back, n, q.maxCoeff() - q.minCoeff())});
+       fmt::format("{} moves by more than half a turn from row to row, forth and back, at {} of {} rows{}: is it in rad, and "
+                   "sampled often enough?",
+                   system.coordinates()[static_cast<std::size_t>(j)].name, forth + back, n,
+                   q.hasNaN() ? "" : fmt::format(", over a range of {:.3g}", q.maxCoeff() - q.minCoeff()))});
 }
 
 // Columns that look clipped, inputs with single values that cannot be, and angles in degrees.
@@ -381,15 +355,15 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
     findings.push_back({Level::warning, std::move(text)});
   check_mechanics(model, log.states, findings);
   if (has_error(findings)) return;
-  append(findings, check_data(system, log.states, system.parameter_values(), log.accelerations, log.stddev, log.stated));
+  append(findings, check_data(system, log.states, system.parameter_values(), log.accelerations, log.stddev, log.stated,
+                              model.noise.estimate));
   append(findings, check_states(system, log.states, system.parameter_values()));
 }
 
 }  // namespace
 
 std::vector<Option> options(CheckOptions& options) {
-  return {{"map", &options.columns, "LOGNAME=NAME,…", "columns by other names: theta1 for q3 also brings dtheta1, ddtheta1", "",
-           "columns"}};
+  return {columns_option(options.columns, "columns by other names: theta1 for q3 also brings dtheta1, ddtheta1")};
 }
 
 std::vector<Finding> check(const Model& model, const CsvTable* log, const CheckOptions& options) {

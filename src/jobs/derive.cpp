@@ -4,10 +4,8 @@
 #include <cmath>
 #include <limits>
 #include <map>
-#include <memory>
 #include <mutex>
 #include <numbers>
-#include <numeric>
 #include <optional>
 
 #include <fmt/format.h>
@@ -18,6 +16,7 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/mechanics/check.hpp"
 #include "gp2/simulate.hpp"
 #include "jobs/raw_log.hpp"
 #include "smoothing/constrained_states.hpp"
@@ -517,8 +516,25 @@ class Deriver {
     parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads),
                  [&](int e, int) { put_episode_together(states, e, conditioned, start); });
     if (!completed.empty()) data_.notes.push_back(fmt::format("from the constraints: {}", fmt::join(completed, ", ")));
-    if (!conditioned) return;
+    if (!conditioned) {
+      leave_out_dependent();
+      return;
+    }
     std::erase_if(data_.independent, [&](int j) { return !data_.is_independent.row(j).any(); });
+  }
+
+  /// Measured accelerations that follow from each other, as those of one sensor that is logged twice, are not all measurements.
+  void leave_out_dependent() {
+    const int nq = system_.nq();
+    const auto independent =
+        dependent_columns(system_, data_.states, system_.parameter_values(), data_.accelerations, data_.stddev.bottomRows(nq));
+    if (!independent || std::ssize(data_.measured) < nq) return;
+    data_.independent = *independent;
+    for (int j = 0; j < nq; ++j) data_.is_independent.row(j) = std::ranges::find(*independent, j) != independent->end();
+    data_.notes.push_back(
+        fmt::format("the derived accelerations obey A ddq = b, or a part of it, far better than noise lets them: only {} of {} "
+                    "are independent",
+                    independent->size(), nq));
   }
 
   /// Where the model file wants the coordinates that are not measured to be sought: q, dq.
@@ -759,7 +775,7 @@ std::vector<Option> options(DeriveOptions& options) {
       {"smoothness", choice(options.smoothness, orders), "",
        "order of the Matérn kernel of the motion; auto: the likelier of 7/2 and 9/2"},
       {"keep", &options.keep, "NAME,…", "further columns of the log to pass on"},
-      {"map", &options.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+      columns_option(options.columns),
   };
 }
 

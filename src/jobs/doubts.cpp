@@ -122,6 +122,7 @@ struct Doubted {
   const Posterior& posterior;
   const std::vector<Observations>& some;       // of the posterior's states
   const std::vector<std::vector<int>>& taken;  // which they are, where those follow each other in time; empty: they do not
+  const std::vector<std::string>& held;        // parameters
   const FittedValues& fitted_values;
 
   /// What changes where the input rows of the states are others, and what one of them adds then. Nothing where that is no number.
@@ -448,9 +449,12 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
       const InputEffect input = inputs[static_cast<std::size_t>(of_input)];
       const auto explanation = explanation_of(doubted, observations, input, doubts, inputs, as_logged, cost);
       if (explanation) {
+        const std::string instead =
+            doubted.held.empty() ? ""
+                                 : fmt::format("; or {}, held by a bound or a prior, is wrong", fmt::join(doubted.held, ", "));
         notes.push_back(
             fmt::format("warning: the data deny the input {}: they are most likely where {}, by {:.2g} in log likelihood. {}",
-                        input.name, explanation->text, explanation->gain, explanation->cause));
+                        input.name, explanation->text, explanation->gain, explanation->cause + instead));
       } else {
         unexplained.push_back(input.name);
         unexplained_gain = std::max(unexplained_gain, gain);
@@ -469,8 +473,8 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
 
 }  // namespace
 
-void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValues& fitted_values,
-                std::vector<std::string>& notes) {
+void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, bool has_row_order,
+                const std::vector<std::string>& held, const FittedValues& fitted_values, std::vector<std::string>& notes) {
   constexpr int enough = 1000, fewest = 10;  // values: a sign or a unit needs no more; states
   constexpr std::size_t most_logs = 10;      // each of which is asked by itself
   const Prior& prior = posterior.prior();
@@ -492,9 +496,9 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
   const auto is_learned = [&](int row) {
     return std::any_of(prior.latents.begin(), prior.latents.end(), [&](const Latent& one) { return one.features->reads(row); });
   };
-  const Doubted doubted{posterior, some, taken, fitted_values};
+  const Doubted doubted{posterior, some, taken, held, fitted_values};
   std::vector<InputEffect> inputs;
-  bool has_far_values = false;
+  bool has_far_values = false, untested = prior.is_nonlinear() && all.size() > 1;
   for (int j = 0; j < layout.nu && prior.mean == Prior::Mean::force; ++j) {
     const int row = layout.u(j);
     if (!force[static_cast<std::size_t>(row)]) continue;
@@ -502,9 +506,11 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
     if (!any([&](const auto& group) { return (group.states().row(row).array() != first).any(); })) {
       notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?",
                                   system.inputs()[static_cast<std::size_t>(j)], first));
-    } else if (const auto far = far_values_text(system.inputs()[static_cast<std::size_t>(j)], values_of(all, row))) {
+    } else if (const auto far = far_values_text(system.inputs()[static_cast<std::size_t>(j)], values_of(all, row), lines)) {
       notes.push_back("warning: " + *far);
       has_far_values = true;
+    } else if (prior.is_nonlinear()) {
+      untested = true;
     } else if (asks && !elsewhere[static_cast<std::size_t>(row)] && !is_learned(row)) {
       std::optional<InputEffect> effect = effect_of(doubted, j);
       if (!effect) continue;
@@ -513,6 +519,11 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
       }
       inputs.push_back(*std::move(effect));
     }
+  }
+  if (untested) {
+    notes.emplace_back(
+        "whether inputs act as logged, and whether logs contradict each other, was not tested: a latent enters nonlinearly; "
+        "look at the residuals of the fit");
   }
   // they make all else look wrong
   if (has_far_values) return;

@@ -448,8 +448,8 @@ std::vector<Option> options(ExciteRequest& request) {
       {"harmonics", &request.n_harmonics, "K", "of each input: frequencies 1/duration … K/duration [Hz]", "", "n_harmonics"},
       {"motions", &request.n_motions, "M", "that are tried", "", "n_motions"},
       {"seed", &request.seed, "S", "of the search; same seed, same motion"},
-      {"map", &request.columns, "LOGNAME=NAME,…", "columns of a log that `start` is, by other names", "", "columns"},
-      not_recorded(threads_option(request.threads)),
+      columns_option(request.columns, "columns of a log that `start` is, by other names"),
+      threads_option(request.threads),
   };
 }
 

@@ -169,7 +169,12 @@ ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
 }
 
 std::vector<Option> options(ExportRequest& request) {
-  std::vector<Option> table = {
+  std::vector<Option> of_view = options(request.view);
+  for (Option& option : of_view) {
+    if (option.name == "dt")
+      option = {"dt", option.value, option.sample, "time step of next-velocity, or of the step for acados [s]"};
+  }
+  const std::vector<Option> files = {
       {"to",
        choice(request.to, {{"c", Target::c},
                            {"casadi", Target::casadi},
@@ -183,26 +188,19 @@ std::vector<Option> options(ExportRequest& request) {
       {"name", &request.name, "NAME", "what the files and every name in them begin with", "that of the system"},
       {"robot", &request.robot, "FILE", "of mjcf and urdf: the robot's file",
        "the one that the model names, beside the model's"}};
-  for (Option& option : options(request.view)) {
-    if (option.name == "dt")
-      option = {"dt", option.value, option.sample, "time step of next-velocity, or of the step for acados [s]"};
-    table.push_back(std::move(option));
-  }
-  table.push_back({"std", YesByDefault{&request.stddev}, "",
-                   "the function of the standard deviation, which stores n²/2 numbers of n reduced observations"});
-  table.push_back({"jacobian", YesByDefault{&request.jacobian}, "", "the function of the Jacobian"});
-  table.push_back(
-      {"float", &request.single_precision, "", "in single precision; refused where its error would show", "", "single"});
-  table.push_back(
+  const std::vector<Option> functions = {
+      {"std", YesByDefault{&request.stddev}, "",
+       "the function of the standard deviation, which stores n²/2 numbers of n reduced observations"},
+      {"jacobian", YesByDefault{&request.jacobian}, "", "the function of the Jacobian"},
+      {"float", &request.single_precision, "", "in single precision; refused where its error would show", "", "single"},
       {"portable_math", &request.portable_math, "",
        "numbers that are the same to the bit on every machine and compiler: exp, sin and others of its own in place of "
-       "those of <math.h>"});
-  table.push_back(
+       "those of <math.h>"},
       {"draws_within", &request.draws_within, "E",
        "of a fit whose hyperparameters are integrated: few draws, which stand for all within this share of a standard "
        "deviation of the exported view: root mean square over up to 300 observed states, of which single ones may be off by more",
-       "all draws"});
-  return table;
+       "all draws"}};
+  return joined({files, of_view, functions});
 }
 
 ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const ExportRequest& request) {

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <exception>
 #include <iterator>
+#include <map>
 #include <numeric>
 #include <optional>
 #include <set>
@@ -73,18 +74,21 @@ FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
   return options;
 }
 
-}  // namespace
-
-int automatic_inducing_variables(std::int64_t n_rows) {
-  constexpr double work = 1e11;  // N M²
-  return static_cast<int>(std::min<double>(most_inducing_variables, std::sqrt(work / static_cast<double>(n_rows))));
+// The rule of `auto`: the directions of a latent have hyperparameters of their own, as in the default prior, or it is a potential; the
+// reduced size is small enough, it is no baseline, and the optimiser runs.
+bool integration_pays(const FitProblem& problem, const FitOptions& options) {
+  const bool has_many = std::any_of(problem.prior.latents.begin(), problem.prior.latents.end(),
+                                    [](const Latent& latent) { return !latent.direction.empty() || latent.is_potential; });
+  return has_many && options.max_iterations > 0 && !problem.prior_options.baseline &&
+         fit_memory(problem, options).reduced_size <= largest_integrated_size;
 }
-
-namespace {
 
 // How many inducing variables there may be; 0: none, exact.
 int settled_inducing(const FitRequest& request, const FitProblem& problem, const FitOptions& options) {
   const bool of_windows = has_sums(problem.observations);
+  if (request.train_on && of_windows) {
+    throw InputError("`train_on` is not for windows of a raw log: `windows=none` learns from its rows");
+  }
   if (request.inducing) {
     if (problem.prior_options.baseline) throw InputError("`inducing` is not for a `baseline`");
     if (of_windows) throw InputError("`inducing` is not for windows of a raw log: `windows=none` learns from its rows");
@@ -143,6 +147,19 @@ void take_logs(const FitRequest& request, const std::vector<Observations>& obser
   if (!is_known) note_shared_rows({}, observations, notes);
 }
 
+// Whether so many observations of each log stand in its order: `max_points` shuffles them.
+bool keeps_row_order(const FitFile& fit, const std::vector<std::int64_t>& n_states) {
+  if (fit.options.empty()) return false;
+  const std::optional<int> max_points = request_of(fit).problem.max_points;
+  return std::ranges::all_of(n_states, [&](std::int64_t n) { return !max_points || n < *max_points; });
+}
+
+bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations) {
+  std::vector<std::int64_t> n_states;
+  for (const Observations& group : observations) n_states.push_back(group.n_data());
+  return keeps_row_order(fit, n_states);
+}
+
 constexpr int rows_of_stretch = 200;
 
 bool is_short(const Observations& group) { return group.n_data() <= 2 * rows_of_stretch; }
@@ -151,6 +168,22 @@ bool is_short(const Observations& group) { return group.n_data() <= 2 * rows_of_
 bool asks_a_stretch(const FitOptions& options, const FitFile& file, const std::vector<Observations>& observations) {
   return options.max_iterations > 0 && !std::all_of(observations.begin(), observations.end(), is_short) &&
          keeps_row_order(file, observations);
+}
+
+// Under mean zero the constraint forces that a latent reads are those of the latents alone.
+void note_load_without_force(const FitProblem& problem, std::vector<std::string>& notes) {
+  const Prior& prior = problem.prior;
+  const auto latent = std::ranges::find_if(prior.latents, &Latent::reads_multipliers);
+  if (prior.mean != Prior::Mean::zero || latent == prior.latents.end()) return;
+  const Eigen::VectorXd parameters = model_values(prior, problem.observations, problem.hyperparameters).parameters;
+  const auto has_force = [&](const Observations& group) {
+    return !group.view().other_system && !prior.system->evaluate(group.states(), parameters).force.isZero(0);
+  };
+  if (std::ranges::none_of(problem.observations, has_force)) return;
+  notes.push_back(fmt::format(
+      "warning: {} reads constraint forces (lambda), and the known force of [mechanics], which makes them, is not used: fit with "
+      "`mean=force`, unless other latents are to learn that force",
+      latent->name));
 }
 
 // What both kinds of preparation end with.
@@ -167,6 +200,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   asked.n_inducing = settled_inducing(request, problem, asked);
   asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
+  note_load_without_force(problem, job.notes);
   job.thin = request.thin && !has_sums(problem.observations) && !problem.robust &&
              request.problem.protocol.name == Protocol::Name::standard;
   job.file.options = options_json(options(request));
@@ -187,222 +221,6 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   return job;
 }
 
-}  // namespace
-
-std::vector<Option> options(FitRequest& request) {
-  FitProblemOptions& problem = request.problem;
-  return joined({
-      in_group(
-          "Data",
-          {
-              {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of what `also` gives",
-               "for accelerations: the model's [noise]"},
-              {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
-              {"map", &problem.columns, "LOGNAME=NAME,…",
-               "columns by other names, in all logs together: theta1 for q3 also brings dtheta1, ddtheta1", "", "columns"},
-              {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
-               "those with a column NAME_std in the log, or all"},
-              {"noise_std",
-               NumberOrWord{&problem.noise_stddev,
-                            {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}},
-               "S", "noise standard deviation of every observed ddq, 'estimate', or 'stated' for the log's NAME_std as they are",
-               "the log's NAME_std times a factor that is estimated, or as the model says"},
-              {"max_points", &problem.max_points, "N",
-               "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion "
-               "best, or so many states of windows",
-               "all; of a raw log 200, or 600 of windows"},
-              {"thin", Switch{&request.thin, "auto", "none"}, "",
-               "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
-              {"project", &problem.project, "",
-               "move states onto position and velocity constraints, with the model's parameters, before anything else"},
-              {"robust", &problem.robust, "",
-               "distrust values that disagree with all others, and say which (docs/command-line.md)"},
-          }),
-      in_group(
-          "What is learned",
-          {
-              {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
-               "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model, where that is relied on"},
-              {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
-               "put the model's latent on the acceleration or on the force", "as the model says"},
-              {"baseline",
-               choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}),
-               "",
-               "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the "
-               "model's features and what else of the state it reads"},
-              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
-              {"protocol",
-               choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
-               "how hyperparameters start and are bounded (docs/priors.md): default, or paper: the set-up of Geist & Trimpe "
-               "2020"},
-              {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
-               "weak log-normal hyper-priors, or none: maximum likelihood within the same bounds"},
-              {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
-               "a small latent for what the kernel would rule out (docs/priors.md), or none"},
-          }),
-      in_group(
-          "How it is learned",
-          {
-              {"restarts", &request.restarts, "R", "runs of the optimiser; the first starts at the model's values",
-               "5; of a baseline 30"},
-              {"max_iterations", &request.max_iterations, "K",
-               "per run, what follows an escape included; 0 conditions at the starting values"},
-              {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
-              {"gradient_tolerance", &request.gradient_tolerance, "G",
-               "stop when the largest entry of the projected gradient is below", "1e-5"},
-              {"reduction_tolerance", &request.reduction_tolerance, "R",
-               "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
-              {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
-              {"seed", &problem.seed, "S", "of restarts and `max_points`"},
-              {"hyperparameters",
-               choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
-                                                {"integrate", HyperparameterChoice::integrate},
-                                                {"auto", HyperparameterChoice::automatic}}),
-               "",
-               fmt::format(
-                   "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
-                   "draws (docs/theory.md, T31), through inducing points of {}, at about {} evaluations of the likelihood; auto: "
-                   "integrate where the directions of a latent have their own, as in the default prior, or it is a potential, "
-                   "and rows times free directions of motion are at most {}",
-                   n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
-              {"standard_errors", YesByDefault{&request.standard_errors}, "",
-               "the standard errors of estimated parameters, which take a few dozen gradients"},
-              {"inducing",
-               NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
-               fmt::format("learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional "
-                           "to their number: at most so many variables, each one function of a latent at one point; none: "
-                           "exactly; auto: exactly up to {} rows times free directions of motion, through at most {} variables "
-                           "beyond, fewer where there are more than 100 000 rows",
-                           largest_exact_size, most_inducing_variables),
-               "auto"},
-              {"train_on", &request.train_on, "N",
-               "find hyperparameters and estimated parameters from so many rows, evenly taken from all logs together, and learn "
-               "from "
-               "all under these: quick, with deviations that may be too small",
-               "all rows"},
-              threads_option(request.threads),
-              not_recorded({"checkpoint", &request.checkpoint, "FILE",
-                            "a FIT.json of the best so far, written anew whenever a run of the optimiser has got lower and every "
-                            "few seconds while one does; `start` goes on from it (docs/command-line.md)",
-                            "none"}),
-          }),
-  });
-}
-
-bool integration_pays(const FitProblem& problem, const FitOptions& options) {
-  const bool has_many = std::any_of(problem.prior.latents.begin(), problem.prior.latents.end(),
-                                    [](const Latent& latent) { return !latent.direction.empty() || latent.is_potential; });
-  return has_many && options.max_iterations > 0 && !problem.prior_options.baseline &&
-         fit_memory(problem, options).reduced_size <= largest_integrated_size;
-}
-
-void require_use_of_commands(const FitRequest& request) {
-  if (!request.problem.commands) return;
-  const std::vector<std::string> estimated = request.problem.estimate.value_or(std::vector<std::string>());
-  const auto is_asked_for = [&](const Parameter& one) { return one.estimate || std::ranges::count(estimated, one.name) > 0; };
-  const auto has_late = [&](const Model& model) {
-    return std::ranges::any_of(model.actuators, [&](const Actuator& one) {
-      return !one.is_direct() || is_asked_for(one.delay) || is_asked_for(one.lag);
-    });
-  };
-  const auto is_of_late = [&](const Log& log) { return log.model != nullptr && has_late(*log.model); };
-  const bool is_late = has_late(request.model) || std::ranges::any_of(request.logs, is_of_late) ||
-                       std::ranges::any_of(request.also, [&](const SideInformation& one) { return is_of_late(one.log); });
-  if (!is_late) throw InputError("`commands`: no input of the model acts late: leave it out");
-}
-
-FitJob prepare_fit(FitRequest request) {
-  require_in_range(request);
-  FitProblem problem = make_fit_problem(request.model, request.logs, request.also, request.problem);
-  return job_of(std::move(request), std::move(problem));
-}
-
-FitRequest request_of(const FitFile& fit) {
-  if (fit.options.empty()) {
-    throw InputError("the fit does not say what it was asked: its file is of a gp2 before format 6; fit anew");
-  }
-  FitRequest request;
-  request.model = fit.model;
-  request.data_source = fit.data_source;
-  // what formats before 7 do not say, and gp2 did not do then
-  request.hyperparameters = HyperparameterChoice::optimise;
-  request.thin = false;
-  read_options(fit.options, options(request), "options of the fit");
-  return request;
-}
-
-// How a checkpoint ended that was written without all rows.
-static constexpr const char* has_some_rows = "interrupted, with some of the rows";
-
-FitJob prepare_fit_again(const FitFile& fit, int threads) {
-  FitRequest request = request_of(fit);
-  request.threads = threads;
-  require_in_range(request);
-  if (request.problem.robust) {
-    throw InputError("`again`: the data of a robust fit are marked by what it distrusts; give its logs by `data`");
-  }
-  const std::vector<std::int64_t> n = fit.n_states();
-  const std::int64_t n_all = std::accumulate(n.begin(), n.end(), std::int64_t{0});
-  if (n_all > n_states(fit.observations)) {
-    throw InputError(fmt::format("`again`: the file holds what {} rows say, and {} of them; give its logs by `data`: {}", n_all,
-                                 n_states(fit.observations), fit.data_source));
-  }
-  if (fit.report.termination == has_some_rows) {
-    throw InputError(fmt::format("`again`: the checkpoint holds some of the rows; give its logs by `data`: {}", fit.data_source));
-  }
-  FitProblem problem;
-  problem.prior_options = fit.prior_options;
-  problem.prior = fit.prior();
-  problem.observations = fit.observations;
-  problem.systems = fit.systems;
-  problem.systems.resize(problem.observations.size());
-  problem.lines.resize(problem.observations.size());
-  problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
-  FitJob job = job_of(std::move(request), std::move(problem));
-  job.file.logs = fit.logs;
-  job.file.notes = fit.notes;
-  job.actuators = fit.report.actuators;
-  return job;
-}
-
-FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
-  FitJob job = prepare_fit(std::move(request));
-  if (fit.logs.empty()) return job;
-  for (const LogFile& log : job.file.logs) {
-    if (fit.has_learned(log)) continue;
-    const auto named = std::ranges::find(fit.logs, log.name, &LogFile::name);
-    job.notes.push_back(
-        named == fit.logs.end()
-            ? fmt::format("warning: {} is not a log that the fit was learned from", log.name)
-            : fmt::format("warning: {} is not as the fit was learned from it: {} bytes, {} rows; then {} bytes, {} rows",
-                          log.name, log.bytes, log.rows, named->bytes, named->rows));
-  }
-  for (const LogFile& log : fit.logs) {
-    if (!job.file.has_learned(log) && std::ranges::find(job.file.logs, log.name, &LogFile::name) == job.file.logs.end()) {
-      job.notes.push_back(fmt::format("warning: the fit was learned from {} too, which is not given", log.name));
-    }
-  }
-  return job;
-}
-
-namespace {
-
-bool keeps_row_order(const FitFile& fit, const std::vector<std::int64_t>& n_states) {
-  if (fit.options.empty()) return false;
-  const std::optional<int> max_points = request_of(fit).problem.max_points;
-  return std::ranges::all_of(n_states, [&](std::int64_t n) { return !max_points || n < *max_points; });
-}
-
-}  // namespace
-
-bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations) {
-  std::vector<std::int64_t> n_states;
-  for (const Observations& group : observations) n_states.push_back(group.n_data());
-  return keeps_row_order(fit, n_states);
-}
-
-namespace {
-
 // What to judge a fit by: of a robust one without the values that it distrusts, which are no measure of its predictions. Of many states
 // every so manieth is kept, whose numbers and lines are those of the log.
 JudgedData judged_data(const Posterior& posterior, const FitReport& report, const std::vector<std::vector<int>>& lines = {}) {
@@ -422,17 +240,6 @@ JudgedData judged_data(const Posterior& posterior, const FitReport& report, cons
   }
   return judged;
 }
-
-}  // namespace
-
-CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
-  CrossValidation scores =
-      cross_validate(posterior, judged_data(posterior, fit.report).observations, keeps_row_order(fit, fit.n_states()));
-  if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
-  return scores;
-}
-
-namespace {
 
 // What residuals say of how many rows are worth one measurement.
 struct Worth {
@@ -456,6 +263,9 @@ struct Worth {
   }
 };
 
+// How a checkpoint ended that was written without all rows.
+constexpr const char* has_some_rows = "interrupted, with some of the rows";
+
 // The best so far, with the rows that it was found from: of many as many as any file of a fit has.
 void save_checkpoint(const FitJob& job, const FitReport& report, const std::vector<Observations>& observations) {
   FitFile file = job.file;
@@ -476,6 +286,78 @@ Fit fit_and_name_gross_errors(const FitProblem& problem, const FitOptions& optio
     if (text.empty()) throw;
     throw NumericalError(fmt::format("{}; the reason may be that {}", error.what(), text));
   }
+}
+
+// Tests of a fit, each by itself: a fit that has taken hours is not lost to what is said of it, nor one test to another.
+class Tests {
+ public:
+  template <typename Test>
+  void run(const char* subject, const Test& test) {
+    try {
+      test();
+    } catch (const std::exception& error) {
+      untested_[error.what()].emplace_back(subject);
+    }
+  }
+  /// What could not be tested, by the reason.
+  void add_notes(std::vector<std::string>& notes) const {
+    for (const auto& [reason, subjects] : untested_)
+      notes.push_back(fmt::format("warning: tests of the fit failed, of {}: {}", fmt::join(subjects, ", "), reason));
+  }
+
+ private:
+  std::map<std::string, std::vector<std::string>> untested_;
+};
+
+// Estimated parameters that a bound or a prior holds rather than the data.
+std::vector<std::string> held_parameters(const FitReport& report) {
+  constexpr double most = 0.7;  // of the deviation of a prior, where the data tell of the parameter
+  std::vector<std::string> held;
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
+    if (!h.is_system_parameter() || h.is_fixed()) continue;
+    bool is_held = h.at_bound();
+    if (report.uncertainty && h.hyperprior.form != HyperPrior::Form::none) {
+      const double scale = h.hyperprior.form == HyperPrior::Form::normal ? 1 : std::abs(h.value);
+      is_held |= report.uncertainty->stddev[static_cast<Eigen::Index>(k)] > most * scale * h.hyperprior.stddev;
+    }
+    if (is_held) held.push_back(h.name);
+  }
+  return held;
+}
+
+// Scores of what is left out, and what residuals and data say of the fit.
+void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, FitOutcome& outcome) {
+  const Posterior& posterior = outcome.posterior;
+  std::vector<std::string>& notes = outcome.notes;
+  std::optional<CrossValidation>& scores = outcome.cross_validation;
+  const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
+  const JudgedData judged = judged_data(posterior, report, job.problem.lines);
+  Tests tests;
+  tests.run("the use of the known force", [&] { add_force_note(posterior, notes); });
+  tests.run("the constraints", [&] { add_constraint_note(posterior, notes); });
+  tests.run("the windows", [&] { add_window_note(posterior, notes); });
+  tests.run("the values left out", [&] { scores = cross_validate(posterior, judged.observations, has_row_order); });
+  if (scores && report.inducing) report.inducing->stretches = scores->stretches;
+  if (report.iterations > 0) tests.run("the noise", [&] { add_noise_notes(posterior, notes); });
+  if (scores) tests.run("the residuals", [&] { add_residual_notes(posterior, judged, scores->residuals, notes); });
+  tests.run("values at the ends of a range", [&] { add_pile_up_notes(judged.observations, *posterior.prior().system, notes); });
+  if (scores) tests.run("the stretches", [&] { add_stretch_note(*scores, notes, posterior.prior()); });
+  FitOptions quick;
+  quick.n_restarts = 1;
+  quick.max_iterations = 50;
+  quick.max_escapes = 0;
+  quick.standard_errors = false;
+  quick.n_threads = options.n_threads;
+  quick.stop = options.stop;
+  const FittedValues fitted_values = [&](const std::vector<Observations>& some) {
+    return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
+  };
+  tests.run("the inputs and the logs",
+            [&] { add_doubts(posterior, judged.lines, has_row_order, held_parameters(report), fitted_values, notes); });
+  const std::string correlated = scores ? correlated_text(scores->residuals) : "";
+  if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
+  tests.add_notes(notes);
 }
 
 FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
@@ -508,37 +390,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   }
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
     if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);
-    // a fit that has taken hours is not lost to what is said of it
-    try {
-      add_force_note(outcome.posterior, outcome.notes);
-      add_constraint_note(outcome.posterior, outcome.notes);
-      add_window_note(outcome.posterior, outcome.notes);
-      const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
-      const JudgedData judged = judged_data(outcome.posterior, result.report, job.problem.lines);
-      outcome.cross_validation = cross_validate(outcome.posterior, judged.observations, has_row_order);
-      if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
-      if (result.report.iterations > 0) add_noise_notes(outcome.posterior, outcome.notes);
-      add_residual_notes(outcome.posterior, judged, outcome.cross_validation->residuals, outcome.notes);
-      add_pile_up_notes(judged.observations, *outcome.posterior.prior().system, outcome.notes);
-      add_stretch_note(*outcome.cross_validation, outcome.notes, outcome.posterior.prior());
-      FitOptions quick;
-      quick.n_restarts = 1;
-      quick.max_iterations = 50;
-      quick.max_escapes = 0;
-      quick.standard_errors = false;
-      quick.n_threads = options.n_threads;
-      quick.stop = stop;
-      add_doubts(
-          outcome.posterior, has_row_order,
-          [&](const std::vector<Observations>& some) {
-            return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
-          },
-          outcome.notes);
-      const std::string correlated = correlated_text(outcome.cross_validation->residuals);
-      if (!correlated.empty()) outcome.notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
-    } catch (const std::exception& error) {
-      outcome.notes.push_back(fmt::format("the residuals of the fit were not tested: {}", error.what()));
-    }
+    add_tests(job, options, result.report, outcome);
   }
   for (std::string& note : actuator_notes(job.actuators)) outcome.notes.push_back(std::move(note));
   outcome.file.report = std::move(result.report);
@@ -656,7 +508,7 @@ FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<vo
     return fewer;
   } catch (const Error& error) {
     if (!job.unaffordable.empty()) throw;
-    if (!all) return run_once(job, progress, stop);
+    if (!all) all = run_once(job, progress, stop);
     if (!is_set(stop))
       all->notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));
     return *all;
@@ -664,6 +516,204 @@ FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<vo
 }
 
 }  // namespace
+
+int automatic_inducing_variables(std::int64_t n_rows) {
+  constexpr double work = 1e11;  // N M²
+  return static_cast<int>(std::min<double>(most_inducing_variables, std::sqrt(work / static_cast<double>(n_rows))));
+}
+
+std::vector<Option> options(FitRequest& request) {
+  FitProblemOptions& problem = request.problem;
+  return joined({
+      in_group(
+          "Data",
+          {
+              {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of what `also` gives",
+               "for accelerations: the model's [noise]"},
+              {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
+              columns_option(problem.columns,
+                             "columns by other names, in all logs together: theta1 for q3 also brings dtheta1, ddtheta1"),
+              {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
+               "those with a column NAME_std in the log, or all"},
+              {"noise_std",
+               NumberOrWord{&problem.noise_stddev,
+                            {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}},
+               "S", "noise standard deviation of every observed ddq, 'estimate', or 'stated' for the log's NAME_std as they are",
+               "the log's NAME_std times a factor that is estimated, or as the model says"},
+              {"max_points", &problem.max_points, "N",
+               "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion "
+               "best, or so many states of windows",
+               "all; of a raw log 200, or 600 of windows"},
+              {"thin", Switch{&request.thin, "auto", "none"}, "",
+               "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
+              {"project", &problem.project, "",
+               "move states onto position and velocity constraints, with the model's parameters, before anything else"},
+              {"robust", &problem.robust, "",
+               "distrust values that disagree with all others, and say which (docs/command-line.md)"},
+          }),
+      in_group(
+          "What is learned",
+          {
+              {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
+               "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model, where that is relied on"},
+              {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
+               "put the model's latent on the acceleration or on the force", "as the model says"},
+              {"baseline",
+               choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}),
+               "",
+               "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the "
+               "model's features and what else of the state it reads"},
+              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
+              {"protocol",
+               choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
+               "how hyperparameters start and are bounded (docs/priors.md): default, or paper: the set-up of Geist & Trimpe "
+               "2020"},
+              {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
+               "weak log-normal hyper-priors, or none: maximum likelihood within the same bounds"},
+              {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
+               "a small latent for what the kernel would rule out (docs/priors.md), or none"},
+          }),
+      in_group(
+          "How it is learned",
+          {
+              {"restarts", &request.restarts, "R", "runs of the optimiser; the first starts at the model's values",
+               "5; of a baseline 30"},
+              {"max_iterations", &request.max_iterations, "K",
+               "per run, what follows an escape included; 0 conditions at the starting values"},
+              {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
+              {"gradient_tolerance", &request.gradient_tolerance, "G",
+               "stop when the largest entry of the projected gradient is below", "1e-5"},
+              {"reduction_tolerance", &request.reduction_tolerance, "R",
+               "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
+              {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
+              {"seed", &problem.seed, "S", "of restarts and `max_points`"},
+              {"hyperparameters",
+               choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
+                                                {"integrate", HyperparameterChoice::integrate},
+                                                {"auto", HyperparameterChoice::automatic}}),
+               "",
+               fmt::format(
+                   "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
+                   "draws (docs/theory.md, T31), through inducing points of {}, at about {} evaluations of the likelihood; auto: "
+                   "integrate where the directions of a latent have their own, as in the default prior, or it is a potential, "
+                   "and rows times free directions of motion are at most {}",
+                   n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
+              {"standard_errors", YesByDefault{&request.standard_errors}, "",
+               "the standard errors of estimated parameters, which take a few dozen gradients"},
+              {"inducing",
+               NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
+               fmt::format("learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional "
+                           "to their number: at most so many variables, each one function of a latent at one point; none: "
+                           "exactly; auto: exactly up to {} rows times free directions of motion, through at most {} variables "
+                           "beyond, fewer where there are more than 100 000 rows",
+                           largest_exact_size, most_inducing_variables),
+               "auto"},
+              {"train_on", &request.train_on, "N",
+               "find hyperparameters and estimated parameters from so many rows, evenly taken from all logs together, and learn "
+               "from "
+               "all under these: quick, with deviations that may be too small",
+               "all rows"},
+              threads_option(request.threads),
+              not_recorded({"checkpoint", &request.checkpoint, "FILE",
+                            "a FIT.json of the best so far, written anew whenever a run of the optimiser has got lower and every "
+                            "few seconds while one does; `start` goes on from it (docs/command-line.md)",
+                            "none"}),
+          }),
+  });
+}
+
+void require_use_of_commands(const FitRequest& request) {
+  if (!request.problem.commands) return;
+  const std::vector<std::string> estimated = request.problem.estimate.value_or(std::vector<std::string>());
+  const auto is_asked_for = [&](const Parameter& one) { return one.estimate || std::ranges::count(estimated, one.name) > 0; };
+  const auto has_late = [&](const Model& model) {
+    return std::ranges::any_of(model.actuators, [&](const Actuator& one) {
+      return !one.is_direct() || is_asked_for(one.delay) || is_asked_for(one.lag);
+    });
+  };
+  const auto is_of_late = [&](const Log& log) { return log.model != nullptr && has_late(*log.model); };
+  const bool is_late = has_late(request.model) || std::ranges::any_of(request.logs, is_of_late) ||
+                       std::ranges::any_of(request.also, [&](const SideInformation& one) { return is_of_late(one.log); });
+  if (!is_late) throw InputError("`commands`: no input of the model acts late: leave it out");
+}
+
+FitJob prepare_fit(FitRequest request) {
+  require_in_range(request);
+  FitProblem problem = make_fit_problem(request.model, request.logs, request.also, request.problem);
+  return job_of(std::move(request), std::move(problem));
+}
+
+FitRequest request_of(const FitFile& fit) {
+  if (fit.options.empty()) {
+    throw InputError("the fit does not say what it was asked: its file is of a gp2 before format 6; fit anew");
+  }
+  FitRequest request;
+  request.model = fit.model;
+  request.data_source = fit.data_source;
+  // what formats before 7 do not say, and gp2 did not do then
+  request.hyperparameters = HyperparameterChoice::optimise;
+  request.thin = false;
+  read_options(fit.options, options(request), "options of the fit");
+  return request;
+}
+
+FitJob prepare_fit_again(const FitFile& fit, int threads) {
+  FitRequest request = request_of(fit);
+  request.threads = threads;
+  require_in_range(request);
+  if (request.problem.robust) {
+    throw InputError("`again`: the data of a robust fit are marked by what it distrusts; give its logs by `data`");
+  }
+  const std::vector<std::int64_t> n = fit.n_states();
+  const std::int64_t n_all = std::accumulate(n.begin(), n.end(), std::int64_t{0});
+  if (n_all > n_states(fit.observations)) {
+    throw InputError(fmt::format("`again`: the file holds what {} rows say, and {} of them; give its logs by `data`: {}", n_all,
+                                 n_states(fit.observations), fit.data_source));
+  }
+  if (fit.report.termination == has_some_rows) {
+    throw InputError(fmt::format("`again`: the checkpoint holds some of the rows; give its logs by `data`: {}", fit.data_source));
+  }
+  FitProblem problem;
+  problem.prior_options = fit.prior_options;
+  problem.prior = fit.prior();
+  problem.observations = fit.observations;
+  problem.systems = fit.systems;
+  problem.systems.resize(problem.observations.size());
+  problem.lines.resize(problem.observations.size());
+  problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
+  FitJob job = job_of(std::move(request), std::move(problem));
+  job.file.logs = fit.logs;
+  job.file.notes = fit.notes;
+  job.actuators = fit.report.actuators;
+  return job;
+}
+
+FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
+  FitJob job = prepare_fit(std::move(request));
+  if (fit.logs.empty()) return job;
+  for (const LogFile& log : job.file.logs) {
+    if (fit.has_learned(log)) continue;
+    const auto named = std::ranges::find(fit.logs, log.name, &LogFile::name);
+    job.notes.push_back(
+        named == fit.logs.end()
+            ? fmt::format("warning: {} is not a log that the fit was learned from", log.name)
+            : fmt::format("warning: {} is not as the fit was learned from it: {} bytes, {} rows; then {} bytes, {} rows",
+                          log.name, log.bytes, log.rows, named->bytes, named->rows));
+  }
+  for (const LogFile& log : fit.logs) {
+    if (!job.file.has_learned(log) && std::ranges::find(job.file.logs, log.name, &LogFile::name) == job.file.logs.end()) {
+      job.notes.push_back(fmt::format("warning: the fit was learned from {} too, which is not given", log.name));
+    }
+  }
+  return job;
+}
+
+CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
+  CrossValidation scores =
+      cross_validate(posterior, judged_data(posterior, fit.report).observations, keeps_row_order(fit, fit.n_states()));
+  if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
+  return scores;
+}
 
 FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOutcome outcome = run_for_what_rows_are_worth(with_actuators(job, stop), progress, stop);

@@ -173,50 +173,6 @@ constexpr GroupFiles versions[] = {
     {"", "sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"},
     {"memory", "sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"}};
 
-}  // namespace
-
-double FitMemory::bytes() const { return shared + std::max(side_by_side * evaluation, posterior); }
-
-FitMemory fit_memory(const FitProblem& problem, const FitOptions& options) {
-  const Sizes sizes = sizes_of(problem);
-  const double n = n_states(problem);
-  FitMemory memory = memory_of(n, sizes.rank * n, sizes.count, options);
-  memory.side_by_side = side_by_side(problem, options);
-  return memory;
-}
-
-std::optional<double> free_memory(const std::filesystem::path& root) {
-  std::optional<double> free = number_of(root / "proc/meminfo", "MemAvailable:");
-  if (!free) return std::nullopt;
-  *free *= 1024;
-  // a line per hierarchy, ID:CONTROLLERS:/PATH; the group and all above it have limits
-  std::istringstream groups(content(root / "proc/self/cgroup").value_or(""));
-  for (std::string line; std::getline(groups, line);) {
-    const std::size_t first = line.find(':'), second = line.find(':', first + 1);
-    if (second == std::string::npos) continue;
-    const std::string controllers = line.substr(first + 1, second - first - 1);
-    for (const GroupFiles& files : versions) {
-      if (controllers != files.controller) continue;
-      std::filesystem::path path = std::filesystem::path(line.substr(second + 1)).relative_path();
-      while (true) {
-        const std::filesystem::path group = root / files.mount / path;
-        const std::optional<double> limit = number_of(group / files.limit, ""), taken = number_of(group / files.taken, "");
-        if (limit && taken) {
-          const double unused = number_of(group / "memory.stat", files.unused_files).value_or(0);
-          free = std::clamp(*limit - *taken + unused, 0.0, *free);
-        }
-        if (path.empty()) break;
-        path = path.parent_path();
-      }
-    }
-  }
-  return free;
-}
-
-bool is_given(double bytes, int n_pieces) { return maps(bytes, n_pieces); }
-
-namespace {
-
 // The most rows of each log with which `fits`, by halving.
 int most_affordable_rows(const FitProblem& problem, const FitOptions& options,
                          const std::function<bool(const FitMemory&)>& fits) {
@@ -264,6 +220,46 @@ FitOptions within_given(const FitProblem& problem, const FitOptions& options, st
 }
 
 }  // namespace
+
+double FitMemory::bytes() const { return shared + std::max(side_by_side * evaluation, posterior); }
+
+FitMemory fit_memory(const FitProblem& problem, const FitOptions& options) {
+  const Sizes sizes = sizes_of(problem);
+  const double n = n_states(problem);
+  FitMemory memory = memory_of(n, sizes.rank * n, sizes.count, options);
+  memory.side_by_side = side_by_side(problem, options);
+  return memory;
+}
+
+std::optional<double> free_memory(const std::filesystem::path& root) {
+  std::optional<double> free = number_of(root / "proc/meminfo", "MemAvailable:");
+  if (!free) return std::nullopt;
+  *free *= 1024;
+  // a line per hierarchy, ID:CONTROLLERS:/PATH; the group and all above it have limits
+  std::istringstream groups(content(root / "proc/self/cgroup").value_or(""));
+  for (std::string line; std::getline(groups, line);) {
+    const std::size_t first = line.find(':'), second = line.find(':', first + 1);
+    if (second == std::string::npos) continue;
+    const std::string controllers = line.substr(first + 1, second - first - 1);
+    for (const GroupFiles& files : versions) {
+      if (controllers != files.controller) continue;
+      std::filesystem::path path = std::filesystem::path(line.substr(second + 1)).relative_path();
+      while (true) {
+        const std::filesystem::path group = root / files.mount / path;
+        const std::optional<double> limit = number_of(group / files.limit, ""), taken = number_of(group / files.taken, "");
+        if (limit && taken) {
+          const double unused = number_of(group / "memory.stat", files.unused_files).value_or(0);
+          free = std::clamp(*limit - *taken + unused, 0.0, *free);
+        }
+        if (path.empty()) break;
+        path = path.parent_path();
+      }
+    }
+  }
+  return free;
+}
+
+bool is_given(double bytes, int n_pieces) { return maps(bytes, n_pieces); }
 
 FitOptions within_memory(const FitProblem& problem, const FitOptions& all_options, std::optional<double> free,
                          std::vector<std::string>& notes, const std::function<bool(double, int)>& given) {

@@ -71,16 +71,11 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
   }
 }
 
-namespace {
-
-// Where a state stands: "line 9 of log 2", or its row where no line is known.
 std::string place_of(const std::vector<std::vector<int>>& lines, std::size_t group, std::size_t state, bool has_one_log) {
   const bool has_line = group < lines.size() && state < lines[group].size();
   return fmt::format("{} {}{}", has_line ? "line" : "row", has_line ? lines[group][state] : static_cast<int>(state) + 1,
                      has_one_log ? "" : fmt::format(" of log {}", group + 1));
 }
-
-}  // namespace
 
 std::string gross_errors_text(const FitProblem& problem) {
   constexpr double few = 0.05;  // of a column's values
@@ -138,10 +133,6 @@ void add_rate_notes(const Posterior& posterior, const Observations& of, std::vec
   for (const std::string& text : wrong_rates(system, of.states(), accelerations)) notes.push_back("warning: " + text);
 }
 
-}  // namespace
-
-namespace {
-
 // The accelerations of each log against the constraints.
 void add_constraint_residual_notes(const Posterior& posterior, const JudgedData& judged, std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < judged.observations.size(); ++g) {
@@ -185,6 +176,26 @@ void add_far_value_note(const JudgedData& judged, const std::vector<TrainingResi
 
 }  // namespace
 
+bool has_dependent_columns(const Posterior& posterior, const Observations& group) {
+  const System& system = prior_of(posterior.prior(), group.view()).reference_system();
+  if (!group.view().is_of_ddq() || group.view().size() < system.nq() || group.has_sums()) return false;
+  MatrixXd accelerations(system.nq(), group.n_data());
+  accelerations(group.view().rows, Eigen::all) = group.values();
+  return dependent_columns(system, group.states(), parameters_of(group.view(), posterior.values().parameters), accelerations)
+      .has_value();
+}
+
+std::vector<std::string> constraint_warnings(const Posterior& posterior, const std::shared_ptr<const OtherSystem>& other_system,
+                                             const std::string& log, const MatrixXd& states, const std::vector<int>& rows,
+                                             const MatrixXd& measured, const MatrixXd& noise_stddev) {
+  std::vector<std::string> warnings;
+  if (posterior.prior().reference) return warnings;
+  for (const ConstraintResidual& one : constraint_residuals(posterior, other_system, states, rows, measured, noise_stddev)) {
+    if (one.is_too_large()) warnings.push_back(fmt::format("warning: {}: {}", log, one.text()));
+  }
+  return warnings;
+}
+
 bool denies_constraints(const Posterior& posterior, const JudgedData& judged) {
   for (std::size_t g = 0; g < judged.observations.size(); ++g) {
     if (!judged.observations[g].view().is_of_ddq()) continue;
@@ -199,7 +210,7 @@ void add_residual_notes(const Posterior& posterior, const JudgedData& judged, co
   std::vector<std::string> large, small;
   for (const TrainingResidual& one : residuals) {
     const Observations& group = judged.observations[one.group];
-    if (one.is_too_small() && !group.noise().is_estimated() && !group.has_sums())
+    if (one.is_too_small() && !group.noise().is_estimated() && !group.has_sums() && !has_dependent_columns(posterior, group))
       small.push_back(fmt::format("{} ({:.2g} of the noise)", one.output, one.rms_in_noise));
     if (one.is_too_large())
       large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
@@ -227,19 +238,20 @@ bool has_far_values(const CrossValidation& of) {
   return std::ranges::any_of(of.residuals, [](const TrainingResidual& one) { return one.n_far > 0; });
 }
 
-// Whether stretches that were left out are predicted much worse than the noise and rows left out one by one, or somewhat worse while
+// Whether stretches that were left out are predicted much worse than the noise and single values, or somewhat worse while
 // the fit is too sure of itself. What the model lacks is taken up between rows that are known, and told by stretches that are not.
 bool predicts_stretches_worse(const CrossValidation& of) {
-  constexpr double several = 3, twice = 2, worth_a_word = 0.01;  // times the noise; the error of single rows; of the spread
+  constexpr double several = 3, twice = 2, worth_a_word = 0.01;  // times the noise; the error of single values; of the spread
   constexpr double somewhat = 1.3, low_coverage = 0.9;
   if (!of.stretches) return false;
-  const Evaluation::Part &rows = of.one_by_one, &stretches = *of.stretches;
+  const Evaluation::Part &values = of.values, &stretches = *of.stretches;
   const double error = stretches.nrmse;
-  if (error > std::max({several * of.nrmse_of_noise, twice * rows.nrmse, worth_a_word})) return true;
-  if (error > somewhat * std::max(of.nrmse_of_noise, rows.nrmse) && stretches.coverage95 < low_coverage) {
+  if (error > std::max({several * of.nrmse_of_noise, twice * values.nrmse, worth_a_word})) return true;
+  if (error > somewhat * std::max(of.nrmse_of_noise, values.nrmse) && stretches.coverage95 < low_coverage) {
     return stretches.n >= enough_rows;
   }
-  return is_coverage_low(stretches.coverage95, stretches.n) && !is_coverage_low(rows.coverage95, rows.n) && error > rows.nrmse;
+  return is_coverage_low(stretches.coverage95, stretches.n) && !is_coverage_low(values.coverage95, values.n) &&
+         error > values.nrmse;
 }
 
 // Whether even between others rows are predicted much worse than the noise, and neither single values nor a column are said to be.
@@ -252,7 +264,7 @@ bool predicts_rows_badly(const CrossValidation& of) {
 // Whether what the fit leaves open is more than a sound model would of as many rows: it errs even between them, and far more beyond.
 bool denies_model(const CrossValidation& of, double error) {
   constexpr double between = 2, beyond = 5, worth_a_warning = 0.1;  // times the noise; of the spread
-  return of.one_by_one.n >= enough_rows && of.one_by_one.nrmse > between * of.nrmse_of_noise &&
+  return of.values.n >= enough_rows && of.values.nrmse > between * of.nrmse_of_noise &&
          error > std::max(beyond * of.nrmse_of_noise, worth_a_warning);
 }
 
@@ -297,12 +309,11 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
         little.what, is_worse_than_mean ? ", worse than their mean would" : "", little.part->nrmse, noise, causes_text(prior)));
   } else if (predicts_stretches_worse(cross_validation)) {
     const Evaluation::Part& stretches = *cross_validation.stretches;
-    notes.push_back(
-        fmt::format("{}stretches of the log that were left out are predicted worse than rows left out one by one: nrmse {:.2g}, "
-                    "not {:.2g}, of "
-                    "which the noise makes {:.2g}; the intervals of 95 % hold {:.0f} %. {}",
-                    denies_model(cross_validation, stretches.nrmse) ? "warning: " : "", stretches.nrmse, rows.nrmse, noise,
-                    100 * stretches.coverage95, causes_text(prior)));
+    notes.push_back(fmt::format(
+        "{}stretches of the log that were left out are predicted worse than single values: nrmse {:.2g}, not {:.2g}, of "
+        "which the noise makes {:.2g}; the intervals of 95 % hold {:.0f} %. {}",
+        denies_model(cross_validation, stretches.nrmse) ? "warning: " : "", stretches.nrmse, cross_validation.values.nrmse, noise,
+        100 * stretches.coverage95, causes_text(prior)));
   } else if (predicts_rows_badly(cross_validation)) {
     notes.push_back(fmt::format(
         "rows left out one by one are predicted far worse than the noise: nrmse {:.2g}, of which the noise makes {:.2g}. {}",
@@ -341,6 +352,28 @@ void add_impossible_note(int n_impossible, int n_draws, std::vector<std::string>
   if (n_impossible == 0) return;
   notes.push_back(fmt::format("warning: {} of {} draws of the hyperparameters are left out: there is no posterior under them",
                               n_impossible, n_draws));
+}
+
+void add_few_values_note(const FitReport& report, const Posterior& posterior, std::vector<std::string>& notes) {
+  constexpr std::ptrdiff_t enough = 3;  // values for each unknown
+  const auto is_estimated = [](const Hyperparameter& h) { return h.is_system_parameter() && !h.is_fixed() && !h.at_bound(); };
+  const std::ptrdiff_t n_parameters = std::ranges::count_if(report.hyperparameters, is_estimated);
+  if (!report.uncertainty || report.draws || n_parameters == 0) return;
+  std::ptrdiff_t n_unknown = n_parameters, n_values = 0;
+  for (const Latent& latent : posterior.prior().latents) {
+    if (!latent.kernel_is_fixed) n_unknown += latent.size();  // of the discrepancy little is asked
+  }
+  for (const Observations& group : posterior.observations()) {
+    // what a constraint makes of others is no measurement of its own
+    const System& system = prior_of(posterior.prior(), group.view()).reference_system();
+    const std::ptrdiff_t most = group.view().is_of_ddq() ? system.nq() - system.nc() : group.view().size();
+    for (const auto& row : group.values().colwise()) n_values += std::min<std::ptrdiff_t>(row.array().isFinite().count(), most);
+  }
+  if (n_values >= enough * n_unknown) return;
+  notes.push_back(
+      fmt::format("warning: {} measured values are few for {} estimated parameters and {} functions: standard errors may be "
+                  "several times too small. Take more rows, or fit with `hyperparameters=integrate`",
+                  n_values, n_parameters, n_unknown - n_parameters));
 }
 
 void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -16,14 +17,27 @@ void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes
 // Input and acceleration columns whose values pile up at an extreme, as clipped ones do.
 void add_pile_up_notes(const std::vector<Observations>& observations, const System& system, std::vector<std::string>& notes);
 
+// Where a state stands: "line 9 of log 2", or its row where no line is known.
+// @param lines  per Observations: the line in its log of each state; empty where it is not known
+std::string place_of(const std::vector<std::vector<int>>& lines, std::size_t group, std::size_t state, bool has_one_log);
+
 // Which measured values lie so far from all others that a fit may fail for them; empty where none do, or many.
 std::string gross_errors_text(const FitProblem& problem);
 
 // What a fit is judged by.
 struct JudgedData {
   std::vector<Observations> observations;    // of the posterior, NaN where a robust fit distrusts a value
-  std::vector<std::vector<int>> lines = {};  // per Observations: the line in its log of each state; empty where it is not known
+  std::vector<std::vector<int>> lines = {};  // as place_of
 };
+
+// Whether accelerations follow from each other, where all are observed.
+bool has_dependent_columns(const Posterior& posterior, const Observations& group);
+
+// What accelerations of a log that the fit has not seen, and their noise, say against the constraints. A baseline knows none.
+// @param rows  of ddq, that are measured
+std::vector<std::string> constraint_warnings(const Posterior& posterior, const std::shared_ptr<const OtherSystem>& other_system,
+                                             const std::string& log, const Eigen::MatrixXd& states, const std::vector<int>& rows,
+                                             const Eigen::MatrixXd& measured, const Eigen::MatrixXd& noise_stddev);
 
 // Whether measured accelerations do not obey the constraints.
 bool denies_constraints(const Posterior& posterior, const JudgedData& judged);
@@ -31,13 +45,9 @@ bool denies_constraints(const Posterior& posterior, const JudgedData& judged);
 // What the residuals say against the data, the constraints or the noise.
 void add_residual_notes(const Posterior& posterior, const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes);
-inline void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
-                               std::vector<std::string>& notes) {
-  add_residual_notes(posterior, {posterior.observations()}, residuals, notes);
-}
 
 // Whether the fit says little of what it has not seen, or less than the noise lets it.
-// @param prior  of which the possible causes are named; null: not known
+// @param prior  whose possible faults are named
 void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes, const Prior& prior);
 
 // Whether residuals that go on from row to row are larger than the noise: then it is the model that is wrong, and not the noise that
@@ -49,6 +59,9 @@ std::string correlated_text(const std::vector<TrainingResidual>& residuals);
 
 // How many draws are left out, where there is no posterior under them.
 void add_impossible_note(int n_impossible, int n_draws, std::vector<std::string>& notes);
+
+// Where few values are measured for each parameter and latent that is estimated from them, and nothing was drawn.
+void add_few_values_note(const FitReport& report, const Posterior& posterior, std::vector<std::string>& notes);
 
 // Whether the draws of the hyperparameters can be relied on.
 void add_draw_notes(const FitReport& report, std::vector<std::string>& notes);

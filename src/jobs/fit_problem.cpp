@@ -8,10 +8,10 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
+#include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
@@ -221,88 +221,12 @@ void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyp
   }
 }
 
-}  // namespace
-
-void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
-  const std::string source = start.file.empty() ? "`start`" : start.file;
-  const auto read = [&] {
-    if (start.file.empty()) {
-      set_start_values(start.values, source, problem.hyperparameters);
-    } else {
-      read_start_values(start.file, problem.hyperparameters);
-    }
-  };
-  if (max_iterations > 0) {
-    read();
-    return;
-  }
-  const std::vector<Hyperparameter> bounded = problem.hyperparameters;
-  for (Hyperparameter& h : problem.hyperparameters) {
-    h.lower = h.positive ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
-    h.upper = std::numeric_limits<double>::max();
-  }
-  read();
-  for (std::size_t k = 0; k < bounded.size(); ++k) {
-    Hyperparameter& h = problem.hyperparameters[k];
-    h.lower = std::min(bounded[k].lower, h.value);
-    h.upper = std::max(bounded[k].upper, h.value);
-    if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
-    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
-                                        source, h.name, h.value, bounded[k].lower, bounded[k].upper));
-  }
-}
-
-namespace {
-
 // Whether columns of a group may follow from each other: more are observed than the constraints leave free.
-bool may_depend(const Posterior& posterior, int group) {
-  const View& view = posterior.observations()[static_cast<std::size_t>(group)].view();
+bool may_depend(const Posterior& posterior, const Observations& group) {
+  const View& view = group.view();
   const System& system = prior_of(posterior.prior(), view).reference_system();
   return view.size() > system.nq() - system.nc();
 }
-
-}  // namespace
-
-std::vector<std::string> notes_of(const FitReport& report, const Posterior& posterior) {
-  std::vector<std::string> dependent, without_noise, notes;
-  for (const Hyperparameter& h : report.hyperparameters) {
-    const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
-    if (h.kind != Hyperparameter::Kind::noise_stddev || !at_lower) continue;
-    if (h.unit.starts_with("stated deviation")) {
-      notes.push_back(
-          fmt::format("{} ended at the lower bound: the log states deviations that are {:.2g} times as large as they "
-                      "seem, or more",
-                      h.name, 1 / h.lower));
-    } else {
-      (may_depend(posterior, h.owner) ? dependent : without_noise).push_back(h.name);
-    }
-  }
-  for (const Hyperparameter& h : report.hyperparameters) {
-    if (h.kind != Hyperparameter::Kind::parameter || !h.at_bound() || report.iterations == 0) continue;
-    notes.push_back(
-        fmt::format("warning: {} ended at its bound, {:.6g}. It may lie beyond, or the model lacks something", h.name, h.value));
-  }
-  for (const UncertaintyNote& note : uncertainty_notes(report)) {
-    notes.push_back(fmt::format("{}{}. {}", note.is_warning ? "warning: " : "", note.text, note.mend));
-  }
-  if (report.termination == FitReport::unsettled) {
-    notes.emplace_back(
-        "warning: the fit has not settled: hyperparameters and the mean of latents that are not linear still changed each other. "
-        "Deviations may be far too small. Of a load and its coefficient the data may tell the product alone: give one of them");
-  }
-  if (!dependent.empty()) {
-    notes.push_back(
-        fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
-                    fmt::join(dependent, ", ")));
-  }
-  if (!without_noise.empty()) {
-    notes.push_back(fmt::format("{} ended at the lower bound: the log has less noise than the fit can tell from none",
-                                fmt::join(without_noise, ", ")));
-  }
-  return notes;
-}
-
-namespace {
 
 // What [noise] says of the range of an estimated σ, where the log states no deviations of which it is a factor.
 void bound_noise(const Model& model, const FitProblem& problem, Hyperparameter& h) {
@@ -319,53 +243,6 @@ void bound_noise(const Model& model, const FitProblem& problem, Hyperparameter& 
   h.value = std::clamp(observations.noise().stddev()[h.index], h.lower, h.upper);
   if (h.hyperprior.form != HyperPrior::Form::none) h.hyperprior.median = h.value;
 }
-
-}  // namespace
-
-std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const FitProblem& problem,
-                                                     const FitProblemOptions& options) {
-  if (options.baseline) return baseline_hyperparameters(problem.prior, problem.observations);
-  std::vector<Hyperparameter> out = default_hyperparameters(problem.prior, trusted_observations(problem),
-                                                            estimated_parameters(model, options), options.protocol);
-  for (Hyperparameter& h : out) {
-    if (h.kind == Hyperparameter::Kind::noise_stddev) bound_noise(model, problem, h);
-  }
-  if (problem.prior_options.discrepancy) tie_discrepancy(problem, out);
-  return out;
-}
-
-FitOptions default_fit_options(const FitProblem& problem) {
-  return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
-}
-
-std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report) {
-  if (!problem.robust) return {};
-  std::ptrdiff_t n_values = 0;
-  for (const Observations& group : problem.observations) n_values += (!group.values().array().isNaN()).count();
-  constexpr std::size_t max_shown = 12;
-  std::vector<std::string> worst;
-  for (const DistrustedValue& value : report.distrusted) {
-    if (worst.size() == max_shown) break;
-    const auto group = static_cast<std::size_t>(value.group);
-    const View& view = problem.observations[group].view();
-    worst.push_back(fmt::format("{} in line {}{} ({:.3g} σ)",
-                                view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)],
-                                problem.lines[group][static_cast<std::size_t>(value.state)],
-                                problem.observations.size() > 1 ? fmt::format(" of log {}", group + 1) : "", value.distance));
-  }
-  if (worst.size() < report.distrusted.size()) worst.emplace_back("…");
-  return {fmt::format("robust: {} of {} values distrusted{}{}", report.distrusted.size(), n_values, worst.empty() ? "" : ": ",
-                      fmt::join(worst, ", "))};
-}
-
-Fit fit(const FitProblem& problem, const FitOptions& options) {
-  if (problem.robust) return fit_robust(problem.prior, problem.observations, problem.hyperparameters, options);
-  const std::optional<Baseline>& baseline = problem.prior_options.baseline;
-  return baseline ? fit_baseline(baseline->kind, problem.prior, problem.observations, problem.hyperparameters, options)
-                  : fit(problem.prior, problem.observations, problem.hyperparameters, options);
-}
-
-namespace {
 
 void require_columns(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
                      const FitProblemOptions& options) {
@@ -463,6 +340,16 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
   }
 }
 
+// Latents that act at none of the states of all logs.
+void note_idle_latents(FitProblem& problem) {
+  ActingStates acting(problem.prior);
+  for (const Observations& group : problem.observations) {
+    const Prior& there = prior_of(problem.prior, group.view());
+    acting.count(there, group.states(), parameters_of(group.view(), problem.prior.system->parameter_values()));
+  }
+  for (const std::string& text : acting.idle_texts()) problem.notes.push_back("warning: " + text);
+}
+
 // what the prior is made of anew, on every other system too
 void remake_prior(const Model& model, FitProblem& problem) {
   problem.prior = make_prior(model, problem.prior_options);
@@ -503,10 +390,6 @@ void centre_features(const Model& model, FitProblem& problem) {
   if (!problem.prior_options.feature_centres.empty()) remake_prior(model, problem);
 }
 
-}  // namespace
-
-namespace {
-
 // Sums over windows of time, in place of the rows that are only their states.
 Observations with_windows(const Observations& rows, const Windows& windows, const std::vector<int>& lines) {
   std::vector<WeightedSum> sums;
@@ -533,6 +416,120 @@ Observations with_windows(const Observations& rows, const Windows& windows, cons
 
 }  // namespace
 
+void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
+  const std::string source = start.file.empty() ? "`start`" : start.file;
+  const auto read = [&] {
+    if (start.file.empty()) {
+      set_start_values(start.values, source, problem.hyperparameters);
+    } else {
+      read_start_values(start.file, problem.hyperparameters);
+    }
+  };
+  if (max_iterations > 0) {
+    read();
+    return;
+  }
+  const std::vector<Hyperparameter> bounded = problem.hyperparameters;
+  for (Hyperparameter& h : problem.hyperparameters) {
+    h.lower = h.positive ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
+    h.upper = std::numeric_limits<double>::max();
+  }
+  read();
+  for (std::size_t k = 0; k < bounded.size(); ++k) {
+    Hyperparameter& h = problem.hyperparameters[k];
+    h.lower = std::min(bounded[k].lower, h.value);
+    h.upper = std::max(bounded[k].upper, h.value);
+    if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
+    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
+                                        source, h.name, h.value, bounded[k].lower, bounded[k].upper));
+  }
+}
+
+std::vector<std::string> notes_of(const FitReport& report, const Posterior& posterior) {
+  std::vector<std::string> dependent, without_noise, notes;
+  const bool never_ran = report.iterations == 0 && !report.converged;
+  for (const Hyperparameter& h : report.hyperparameters) {
+    const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
+    if (h.kind != Hyperparameter::Kind::noise_stddev || !at_lower || never_ran) continue;
+    const Observations& group = posterior.observations()[static_cast<std::size_t>(h.owner)];
+    if (h.unit.starts_with("stated deviation") && !has_dependent_columns(posterior, group)) {
+      notes.push_back(
+          fmt::format("{} ended at the lower bound: the log states deviations that are {:.2g} times as large as they "
+                      "seem, or more",
+                      h.name, 1 / h.lower));
+    } else {
+      (may_depend(posterior, group) ? dependent : without_noise).push_back(h.name);
+    }
+  }
+  for (const Hyperparameter& h : report.hyperparameters) {
+    if (!h.is_system_parameter() || !h.at_bound() || never_ran) continue;
+    if (report.uncertainty && std::isinf(report.uncertainty->stddev[&h - report.hyperparameters.data()])) continue;  // by chance
+    notes.push_back(
+        fmt::format("warning: {} ended at its bound, {:.6g}. It may lie beyond, or the model lacks something", h.name, h.value));
+  }
+  for (const UncertaintyNote& note : uncertainty_notes(report)) {
+    notes.push_back(fmt::format("{}{}. {}", note.is_warning ? "warning: " : "", note.text, note.mend));
+  }
+  if (!never_ran) add_few_values_note(report, posterior, notes);
+  if (report.termination == FitReport::unsettled) {
+    notes.emplace_back(
+        "warning: the fit has not settled: hyperparameters and the mean of latents that are not linear still changed each other. "
+        "Deviations may be far too small. Of a load and its coefficient the data may tell the product alone: give one of them");
+  }
+  if (!dependent.empty()) {
+    notes.push_back(
+        fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
+                    fmt::join(dependent, ", ")));
+  }
+  if (!without_noise.empty()) {
+    notes.push_back(fmt::format("{} ended at the lower bound: the log has less noise than the fit can tell from none",
+                                fmt::join(without_noise, ", ")));
+  }
+  return notes;
+}
+
+std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const FitProblem& problem,
+                                                     const FitProblemOptions& options) {
+  if (options.baseline) return baseline_hyperparameters(problem.prior, problem.observations);
+  std::vector<Hyperparameter> out = default_hyperparameters(problem.prior, trusted_observations(problem),
+                                                            estimated_parameters(model, options), options.protocol);
+  for (Hyperparameter& h : out) {
+    if (h.kind == Hyperparameter::Kind::noise_stddev) bound_noise(model, problem, h);
+  }
+  if (problem.prior_options.discrepancy) tie_discrepancy(problem, out);
+  return out;
+}
+
+FitOptions default_fit_options(const FitProblem& problem) {
+  return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
+}
+
+std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report) {
+  if (!problem.robust) return {};
+  std::ptrdiff_t n_values = 0;
+  for (const Observations& group : problem.observations) n_values += (!group.values().array().isNaN()).count();
+  constexpr std::size_t max_shown = 12;
+  std::vector<std::string> worst;
+  for (const DistrustedValue& value : report.distrusted) {
+    if (worst.size() == max_shown) break;
+    const auto group = static_cast<std::size_t>(value.group);
+    const View& view = problem.observations[group].view();
+    worst.push_back(fmt::format(
+        "{} in {} ({:.3g} σ)", view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)],
+        place_of(problem.lines, group, static_cast<std::size_t>(value.state), problem.observations.size() == 1), value.distance));
+  }
+  if (worst.size() < report.distrusted.size()) worst.emplace_back("…");
+  return {fmt::format("robust: {} of {} values distrusted{}{}", report.distrusted.size(), n_values, worst.empty() ? "" : ": ",
+                      fmt::join(worst, ", "))};
+}
+
+Fit fit(const FitProblem& problem, const FitOptions& options) {
+  if (problem.robust) return fit_robust(problem.prior, problem.observations, problem.hyperparameters, options);
+  const std::optional<Baseline>& baseline = problem.prior_options.baseline;
+  return baseline ? fit_baseline(baseline->kind, problem.prior, problem.observations, problem.hyperparameters, options)
+                  : fit(problem.prior, problem.observations, problem.hyperparameters, options);
+}
+
 FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
                             const FitProblemOptions& options) {
   if (logs.empty() && also.empty()) throw InputError("there is nothing to fit: give logs by `data`, or what is known by `also`");
@@ -557,6 +554,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   }
   add_side_information(model, also, options, estimated, problem);
   add_late(model, options, problem);
+  note_idle_latents(problem);
   if (options.protocol.name == Protocol::Name::standard) centre_features(model, problem);
   if (has_discrepancy(model, problem, options)) add_discrepancy(model, problem);
   problem.hyperparameters = starting_hyperparameters(model, problem, options);

@@ -65,19 +65,19 @@ double evaluation_seconds(const FitProblem& problem, const FitOptions& options, 
   return cubic * std::pow(scale / n_parts, 3) + std::max(0.0, all - cubic) * std::pow(scale / n_parts, 2);
 }
 
-void note_time(double seconds, int reduced_size, std::vector<std::string>& notes) {
+void note_time(double seconds, int reduced_size, std::vector<std::string>& notes, bool takes_points) {
   if (!(seconds > worth_telling)) return;
   notes.push_back(fmt::format(
-      "one evaluation of the likelihood factors a matrix of size {} and takes about {} here, and a fit takes hundreds: it can be "
-      "interrupted at any time; fewer rows (`max_points`) take less, with the cube of their number, and inducing points "
-      "(`inducing=auto`) in proportion to it",
-      reduced_size, about(seconds)));
+      "one evaluation of the likelihood factors a matrix of size {} and takes about {} here, and a fit takes hundreds: "
+      "it can be interrupted at any time; fewer rows (`max_points`) take less, with the cube of their number{}",
+      reduced_size, about(seconds), takes_points ? ", and inducing points (`inducing=M`) in proportion to it" : ""));
 }
 
 void note_time(const FitProblem& problem, const FitOptions& options, int reduced_size, std::vector<std::string>& notes) {
   // one of twice the timed size takes eight times as long as the piece
-  if (reduced_size < 2 * timed_size || options.n_inducing > 0) return;
-  note_time(evaluation_seconds(problem, options, reduced_size), reduced_size, notes);
+  if (reduced_size < 2 * timed_size || options.n_inducing > 0 || has_sums(problem.observations)) return;
+  const bool takes_points = !problem.prior_options.baseline;
+  note_time(evaluation_seconds(problem, options, reduced_size), reduced_size, notes, takes_points);
 }
 
 }  // namespace gp2

@@ -3,7 +3,6 @@
 #include <algorithm>
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
 #include "gp2/error.hpp"
@@ -102,6 +101,10 @@ bool read_value(const Json& json, const OptionValue& value) {
 
 Option threads_option(int& threads) {
   return not_recorded({"threads", &threads, "K", "0: as many as the machine has; results do not depend on it"});
+}
+
+Option columns_option(std::map<std::string, std::string>& columns, const std::string& text) {
+  return {"map", &columns, "LOGNAME=NAME,…", text, "", "columns"};
 }
 
 void require_threads(int threads) {

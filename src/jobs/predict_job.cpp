@@ -13,6 +13,7 @@
 #include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
@@ -70,28 +71,6 @@ void predict_marginals(const Posterior& posterior, const View& view, const Matri
   if (n_clipped > 0) out.notes.push_back(fmt::format("{} variances were negative by rounding and set to 0", n_clipped));
 }
 
-}  // namespace
-
-void require_memory_of_samples(const Posterior& posterior, const View& view, Index n_states, int n_samples,
-                               std::optional<double> free) {
-  constexpr double number = 8, name = 64, small = 1e8, share = 0.9;  // bytes; of what is free
-  const auto n = static_cast<double>(n_states);
-  double n_latent = 0;
-  for (const Latent& latent : posterior.prior().latents) n_latent += n * latent.size();
-  // the covariance of the latents and its factor; then, of each sample, latents twice and the view in four places
-  const double all = number * 2 * n_latent * n_latent;
-  const double one = number * (2 * n_latent + 4 * n * view.size()) + name * view.size();
-  const double bytes = all + n_samples * one;
-  if (!free || bytes <= std::max(share * *free, small)) return;
-  constexpr double gigabyte = 1e9;
-  const double most = std::floor((share * *free - all) / one);
-  throw InputError(fmt::format(
-      "`samples`: {} samples of {} rows together take {:.3g} GB of memory, of which {:.1f} GB are free; {}", n_samples, n_states,
-      bytes / gigabyte, *free / gigabyte, most >= 1 ? fmt::format("{:.0f} samples would fit", most) : "take fewer rows"));
-}
-
-namespace {
-
 // NAME_sample1 … of every name, then NAME_sample2 …: draws of the view at all states together.
 void add_samples(const Posterior& posterior, const View& view, const MatrixXd& states, int n_samples, std::uint64_t seed,
                  PredictOutcome& out) {
@@ -110,12 +89,7 @@ void add_distance(const Posterior& posterior, const View& view, const MatrixXd& 
   out.names.emplace_back("distance_from_data");
   out.values.conservativeResize(out.values.rows() + 1, Eigen::NoChange);
   out.values.bottomRows(1) = distance.transpose();
-  const Index n_far = (distance.array() > Posterior::far_from_data).count();
-  if (n_far == 0) return;
-  out.notes.push_back(
-      fmt::format("{} of {} states are far from the data, where deviations are too small as a rule: "
-                  "distance_from_data is above {:.3g}, up to {:.3g}",
-                  n_far, distance.size(), Posterior::far_from_data, distance.maxCoeff()));
+  if (auto note = note_of_distance(distance)) out.notes.push_back(std::move(*note));
 }
 
 // Some of the same data, where every direction of a latent may be what the largest of them is: a fit makes those small, or smooth, of
@@ -138,113 +112,6 @@ Posterior with_equal_directions(const Posterior& posterior) {
   values.inducing = nullptr;
   return {posterior.prior(), evenly(posterior.observations(), enough / posterior.prior().system->nq()), std::move(values)};
 }
-
-// What the data tell little of has the deviation that the prior assumes, by sizes learned from what they do tell.
-void note_what_is_not_told(const Posterior& posterior, const View& view, const MatrixXd& states, PredictOutcome& out) {
-  constexpr std::size_t enough = 200;  // states
-  constexpr double little = 0.5, small = 0.1, exact = 1e-9;
-  const auto distance = out.values.row(out.values.rows() - 1);
-  std::vector<Index> near;
-  for (Index i = 0; i < states.cols(); ++i) {
-    if (distance(i) <= Posterior::far_from_data) near.push_back(i);
-  }
-  if (near.empty()) return;
-  std::vector<Index> some;
-  for (std::size_t k = 0; k < std::min(enough, near.size()); ++k)
-    some.push_back(near[k * near.size() / std::min(enough, near.size())]);
-  const auto mean_square = [](const MatrixXd& of) -> Eigen::VectorXd { return of.array().square().rowwise().mean(); };
-  const Eigen::VectorXd predicted = mean_square(out.values.topRows(view.size())(Eigen::all, some));
-  // where the deviation is small beside what is predicted, the prior is not asked
-  const auto share_left = [&](const Posterior& of) -> Eigen::VectorXd {
-    const auto variance = [&](const Posterior& one) {
-      return mean_square(one.marginal(view, states(Eigen::all, some), /*n_threads=*/0).stddev());
-    };
-    const Eigen::VectorXd assumed = variance(of.without_data()), of_data = variance(of);
-    const auto counts =
-        assumed.array() > exact * exact * assumed.maxCoeff() && of_data.array() > small * small * predicted.array();
-    return counts.select(of_data.cwiseQuotient(assumed), 0);
-  };
-  Eigen::VectorXd left = share_left(posterior);
-  if (view.quantity != View::Quantity::constrained_acceleration && !posterior.prior().is_nonlinear() &&
-      !has_sums(posterior.observations()))
-    left = left.cwiseMax(share_left(with_equal_directions(posterior)));
-  std::vector<std::string> names;
-  for (Index k = 0; k < left.size(); ++k) {
-    if (left[k] <= little) continue;
-    names.push_back(fmt::format("{} ({:.0f} %)", out.names[static_cast<std::size_t>(k)], 100 * left[k]));
-  }
-  if (names.empty()) return;
-  out.notes.push_back(
-      fmt::format("the data tell little of {}: so much is left of the variance that the prior assumes, by sizes learned from "
-                  "what they do tell, and deviations are no better than that assumption",
-                  fmt::join(names, ", ")));
-}
-
-Option columns_option(std::map<std::string, std::string>& columns) {
-  return {"map", &columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"};
-}
-
-}  // namespace
-
-std::vector<Option> options(ViewRequest& request) {
-  std::vector<std::pair<std::string, View::Quantity>> words;
-  for (const View::Quantity& quantity : View::Quantity::all()) words.emplace_back(quantity->word(), quantity);
-  return {
-      {"view", choice(request.quantity, words), "",
-       "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; next-velocity: "
-       "dq1_next …, with `dt`; force: force_q1 …, what was learned, as an applied force"},
-      {"dt", &request.time_step, "SECONDS", "time step of next-velocity [s]"},
-      {"latent", &request.latent, "NAME",
-       "only what this latent adds to the view, by its name: NAME@LATENT; the small one that a fit adds is called discrepancy"},
-  };
-}
-
-FitSystem system_of(const FitFile& fit, const Prior& prior, const std::shared_ptr<const Model>& system) {
-  if (!system || is_same(*system, fit.model)) return {&fit.model, fit.model.actuators, nullptr, prior};
-  const auto other_system = make_other_system(fit.model, *system, fit.prior_options);
-  return {system.get(), shared_actuators(fit.model.actuators, *system), other_system, other_system->prior};
-}
-
-PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request) {
-  PredictedView out{system_of(fit, prior, request.system), {}, {}};
-  out.view = View::all(request.quantity, *out.prior.system);
-  out.view.other_system = out.other_system;
-  const View::Quantity& asked = request.quantity;
-  const bool is_of_constraints = asked == View::Quantity::multipliers || asked == View::Quantity::constraint_force;
-  if (is_of_constraints && out.prior.system->nc() == 0) {
-    throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
-  }
-  set_time_step(out.view, request.time_step);
-  if (request.latent) out.view.latent = latents_called(prior, *request.latent, "`latent`");
-  out.names = out.view.names(*out.prior.system, request.latent.value_or(""));
-  return out;
-}
-
-std::vector<Option> options(PredictRequest& request) {
-  using Covariance = PredictRequest::Covariance;
-  std::vector<Option> table = options(request.view);
-  table.push_back(
-      {"cov", choice(request.covariance, {{"none", Covariance::none}, {"std", Covariance::stddev}, {"full", Covariance::full}}),
-       "", "none; std: NAME_std; full: also cov_NAME1_NAME2, the upper triangle. Without measurement noise"});
-  table.push_back({"samples", &request.n_samples, "S",
-                   "draws of all rows together: NAME_sample1 … NAME_sampleS; time grows with the cube of the rows", "",
-                   "n_samples"});
-  table.push_back({"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"});
-  table.push_back({"unconditioned", &request.unconditioned, "",
-                   "predict from the prior under the fitted hyperparameters, as if there had been no data"});
-  table.push_back(
-      {"inverse_dynamics", &request.inverse_dynamics, "",
-       "instead of a view: the inputs that produce the accelerations ddq1 … which the CSV has, u1 …, and ddq1_missed …, "
-       "what is missed of them"});
-  table.push_back(
-      {"potential", &request.potential, "NAME",
-       "instead of a view: the energy of the latent of this name, which the model has as a potential, less that at the "
-       "first row: potential@NAME [J], known up to a constant"});
-  table.push_back(columns_option(request.columns));
-  return table;
-}
-
-namespace {
 
 PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior, const CsvTable& table,
                                  const PredictRequest& request) {
@@ -319,6 +186,128 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
 
 }  // namespace
 
+std::optional<std::string> note_of_distance(const Eigen::VectorXd& distance) {
+  const Index n_far = (distance.array() > Posterior::far_from_data).count();
+  if (n_far == 0) return std::nullopt;
+  return fmt::format(
+      "{} of {} states are far from the data, where deviations are too small as a rule: distance_from_data is above {:.3g}, up "
+      "to "
+      "{:.3g}",
+      n_far, distance.size(), Posterior::far_from_data, distance.maxCoeff());
+}
+
+std::optional<std::string> note_of_untold(const Posterior& posterior, const PredictedView& at, const MatrixXd& states,
+                                          const MatrixXd& mean, const Eigen::VectorXd& distance) {
+  constexpr std::size_t enough = 200;  // states
+  constexpr double little = 0.5, small = 0.1, exact = 1e-9;
+  std::vector<Index> near;
+  for (Index i = 0; i < states.cols(); ++i) {
+    if (distance(i) <= Posterior::far_from_data) near.push_back(i);
+  }
+  if (near.empty()) return std::nullopt;
+  std::vector<Index> some;
+  for (std::size_t k = 0; k < std::min(enough, near.size()); ++k)
+    some.push_back(near[k * near.size() / std::min(enough, near.size())]);
+  const auto mean_square = [](const MatrixXd& of) -> Eigen::VectorXd { return of.array().square().rowwise().mean(); };
+  const Eigen::VectorXd predicted = mean_square(mean(Eigen::all, some));
+  // where the deviation is small beside what is predicted, the prior is not asked
+  const auto share_left = [&](const Posterior& of) -> Eigen::VectorXd {
+    const auto variance = [&](const Posterior& one) {
+      return mean_square(one.marginal(at.view, states(Eigen::all, some), /*n_threads=*/0).stddev());
+    };
+    const Eigen::VectorXd assumed = variance(of.without_data()), of_data = variance(of);
+    const auto counts =
+        assumed.array() > exact * exact * assumed.maxCoeff() && of_data.array() > small * small * predicted.array();
+    return counts.select(of_data.cwiseQuotient(assumed), 0);
+  };
+  Eigen::VectorXd left = share_left(posterior);
+  if (at.view.quantity != View::Quantity::constrained_acceleration && !posterior.prior().is_nonlinear() &&
+      !has_sums(posterior.observations()))
+    left = left.cwiseMax(share_left(with_equal_directions(posterior)));
+  std::vector<std::string> names;
+  for (Index k = 0; k < left.size(); ++k) {
+    if (left[k] > little) names.push_back(fmt::format("{} ({:.0f} %)", at.names[static_cast<std::size_t>(k)], 100 * left[k]));
+  }
+  if (names.empty()) return std::nullopt;
+  return fmt::format(
+      "the data tell little of {}: so much is left of the variance that the prior assumes, by sizes learned from what they do "
+      "tell, "
+      "and deviations are no better than that assumption",
+      fmt::join(names, ", "));
+}
+
+void require_memory_of_samples(const Posterior& posterior, const View& view, Index n_states, int n_samples,
+                               std::optional<double> free) {
+  constexpr double number = 8, name = 64, small = 1e8, share = 0.9;  // bytes; of what is free
+  const auto n = static_cast<double>(n_states);
+  double n_latent = 0;
+  for (const Latent& latent : posterior.prior().latents) n_latent += n * latent.size();
+  // the covariance of the latents and its factor; then, of each sample, latents twice and the view in four places
+  const double all = number * 2 * n_latent * n_latent;
+  const double one = number * (2 * n_latent + 4 * n * view.size()) + name * view.size();
+  const double bytes = all + n_samples * one;
+  if (!free || bytes <= std::max(share * *free, small)) return;
+  constexpr double gigabyte = 1e9;
+  const double most = std::floor((share * *free - all) / one);
+  throw InputError(fmt::format(
+      "`samples`: {} samples of {} rows together take {:.3g} GB of memory, of which {:.1f} GB are free; {}", n_samples, n_states,
+      bytes / gigabyte, *free / gigabyte, most >= 1 ? fmt::format("{:.0f} samples would fit", most) : "take fewer rows"));
+}
+
+std::vector<Option> options(ViewRequest& request) {
+  std::vector<std::pair<std::string, View::Quantity>> words;
+  for (const View::Quantity& quantity : View::Quantity::all()) words.emplace_back(quantity->word(), quantity);
+  return {
+      {"view", choice(request.quantity, words), "",
+       "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; next-velocity: "
+       "dq1_next …, with `dt`; force: force_q1 …, what was learned, as an applied force"},
+      {"dt", &request.time_step, "SECONDS", "time step of next-velocity [s]"},
+      {"latent", &request.latent, "NAME",
+       "only what this latent adds to the view, by its name: NAME@LATENT; the small one that a fit adds is called discrepancy"},
+  };
+}
+
+FitSystem system_of(const FitFile& fit, const Prior& prior, const std::shared_ptr<const Model>& system) {
+  if (!system || is_same(*system, fit.model)) return {&fit.model, fit.model.actuators, nullptr, prior};
+  const auto other_system = make_other_system(fit.model, *system, fit.prior_options);
+  return {system.get(), shared_actuators(fit.model.actuators, *system), other_system, other_system->prior};
+}
+
+PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request) {
+  PredictedView out{system_of(fit, prior, request.system), {}, {}};
+  out.view = View::all(request.quantity, *out.prior.system);
+  out.view.other_system = out.other_system;
+  const View::Quantity& asked = request.quantity;
+  const bool is_of_constraints = asked == View::Quantity::multipliers || asked == View::Quantity::constraint_force;
+  if (is_of_constraints && out.prior.system->nc() == 0) {
+    throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
+  }
+  set_time_step(out.view, request.time_step);
+  if (request.latent) out.view.latent = latents_called(prior, *request.latent, "`latent`");
+  out.names = out.view.names(*out.prior.system, request.latent.value_or(""));
+  return out;
+}
+
+std::vector<Option> options(PredictRequest& request) {
+  using Covariance = PredictRequest::Covariance;
+  return joined(
+      {options(request.view),
+       {{"cov", choice(request.covariance, {{"none", Covariance::none}, {"std", Covariance::stddev}, {"full", Covariance::full}}),
+         "", "none; std: NAME_std; full: also cov_NAME1_NAME2, the upper triangle. Without measurement noise"},
+        {"samples", &request.n_samples, "S",
+         "draws of all rows together: NAME_sample1 … NAME_sampleS; time grows with the cube of the rows", "", "n_samples"},
+        {"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"},
+        {"unconditioned", &request.unconditioned, "",
+         "predict from the prior under the fitted hyperparameters, as if there had been no data"},
+        {"inverse_dynamics", &request.inverse_dynamics, "",
+         "instead of a view: the inputs that produce the accelerations ddq1 … which the CSV has, u1 …, and ddq1_missed …, "
+         "what is missed of them"},
+        {"potential", &request.potential, "NAME",
+         "instead of a view: the energy of the latent of this name, which the model has as a potential, less that at the "
+         "first row: potential@NAME [J], known up to a constant"},
+        columns_option(request.columns)}});
+}
+
 std::optional<std::string> note_of_open_inputs(const InverseDynamics& found, const Model& model, const std::string& states) {
   const System& system = *model.system;
   const auto& open = found.open;
@@ -353,7 +342,11 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
   if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
   if (request.unconditioned) return out;
   add_distance(posterior, at.view, log.states, out);
-  if (request.covariance != PredictRequest::Covariance::none) note_what_is_not_told(posterior, at.view, log.states, out);
+  if (request.covariance == PredictRequest::Covariance::none) return out;
+  const Eigen::VectorXd distance = out.values.bottomRows(1).transpose();
+  if (auto note = note_of_untold(posterior, at, log.states, out.values.topRows(at.view.size()), distance)) {
+    out.notes.push_back(std::move(*note));
+  }
   return out;
 }
 
@@ -381,10 +374,9 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
   out.evaluation =
       at_states_of(name, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });
-  if (at.prior.reference) return out;  // a baseline knows no constraint
-  for (const ConstraintResidual& one :
-       constraint_residuals(posterior, at.view.other_system, states.states, rows, states.accelerations, options.noise_stddev)) {
-    if (one.is_too_large()) out.notes.push_back(fmt::format("warning: {}: {}", name, one.text()));
+  for (std::string& text : constraint_warnings(posterior, at.view.other_system, name, states.states, rows, states.accelerations,
+                                               options.noise_stddev)) {
+    out.notes.push_back(std::move(text));
   }
   return out;
 }

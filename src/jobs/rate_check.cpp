@@ -285,12 +285,16 @@ std::vector<Index> far_values(const Ref<const RowVectorXd>& values) {
   return rows;
 }
 
-std::optional<std::string> far_values_text(const std::string& input, const std::vector<RowVectorXd>& logs) {
+std::optional<std::string> far_values_text(const std::string& input, const std::vector<RowVectorXd>& logs,
+                                           const std::vector<std::vector<int>>& lines) {
   std::vector<std::string> far;
   for (std::size_t log = 0; log < logs.size(); ++log) {
     const std::string of_log = logs.size() > 1 ? fmt::format(" of log {}", log + 1) : "";
-    for (const Index row : far_values(logs[log]))
-      far.push_back(fmt::format("{:.4g} at row {}{}", logs[log][row], row + 1, of_log));
+    for (const Index i : far_values(logs[log])) {
+      const bool has_line = log < lines.size() && !lines[log].empty();
+      const Index row = has_line ? lines[log][static_cast<std::size_t>(i)] - 1 : i + 1;
+      far.push_back(fmt::format("{:.4g} at row {}{}", logs[log][i], row, of_log));
+    }
   }
   if (far.empty()) return std::nullopt;
   return fmt::format("single values of the input {} lie far from all others: {}. Mend them, or leave these rows out", input,

@@ -48,7 +48,9 @@ std::optional<PileUp> pile_up(const Eigen::Ref<const Eigen::RowVectorXd>& values
 std::vector<Eigen::Index> far_values(const Eigen::Ref<const Eigen::RowVectorXd>& values);
 
 /// Which of an input's values in some logs these are, if any.
-std::optional<std::string> far_values_text(const std::string& input, const std::vector<Eigen::RowVectorXd>& logs);
+/// @param lines  per log: the line of each value, below a header; empty where the values are all rows of the log
+std::optional<std::string> far_values_text(const std::string& input, const std::vector<Eigen::RowVectorXd>& logs,
+                                           const std::vector<std::vector<int>>& lines = {});
 
 /// Whether an angle in degrees is wrapped: from sample to sample it jumps by nearly 360, between -180 and 180 or 0 and 360, and
 /// moves little else.

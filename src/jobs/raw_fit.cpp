@@ -3,20 +3,25 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <numbers>
 #include <set>
 #include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/resample.hpp"
+#include "gp2/simulation/projected_states.hpp"
+#include "inference/inducing_summary.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
+using Eigen::VectorXd;
 
 namespace {
 
@@ -27,16 +32,18 @@ constexpr int first_line = 2;  // of a table, that has its first row
 int part_of(Index row, Index n_rows) { return static_cast<int>(row * n_pieces / n_rows) % n_parts; }
 
 // Accelerations at all states, each by what the other parts tell.
-// @param lines  of the observed states, in the table of all states
+// @param lines  of all rows that were fitted to, in the table of all states
 LearnedAccelerations left_out_accelerations(const Posterior& posterior, const std::vector<int>& lines, const MatrixXd& states) {
   const View view = View::constrained_acceleration(*posterior.prior().system);
   const int nq = posterior.prior().system->nq();
   LearnedAccelerations out{MatrixXd(nq, states.cols()), MatrixXd(nq, states.cols())};
+  const std::shared_ptr<const InducingSummary> summary = posterior.summary();
+  const int step = summary ? summary->kept.step : 1;
   for (int part = 0; part < n_parts; ++part) {
     std::vector<int> others;
     std::vector<Index> here;
-    for (std::size_t i = 0; i < lines.size(); ++i) {
-      if (part_of(lines[i] - first_line, states.cols()) != part) others.push_back(static_cast<int>(i));
+    for (int i = 0; i < posterior.observations().front().n_data(); ++i) {
+      if (part_of(lines[static_cast<std::size_t>(i * step)] - first_line, states.cols()) != part) others.push_back(i);
     }
     for (Index i = 0; i < states.cols(); ++i) {
       if (part_of(i, states.cols()) == part) here.push_back(i);
@@ -58,7 +65,7 @@ bool learns_from_windows(const FitRequest& request, const DerivedData& data, con
   const System& system = *request.model.system;
   if (system.has_constraint_noise()) return false;
   // velocities that are measured say more than the positions alone
-  LogReader reader(log, system);
+  LogReader reader = open_log(request.model, log, problem.columns);
   return std::ranges::none_of(
       data.measured, [&](int j) { return reader.column(system.coordinates()[static_cast<std::size_t>(j)].velocity()) >= 0; });
 }
@@ -89,13 +96,15 @@ class WindowChoice {
   [[nodiscard]] bool covers_log() const { return covers_log_; }
   [[nodiscard]] const std::vector<int>& rows() const { return rows_; }
 
-  [[nodiscard]] Windows windows() const {
+  /// @param sensitivities  as sensitivities_of, at rows(); empty: none
+  [[nodiscard]] Windows windows(const std::vector<StateSensitivity>& sensitivities) const {
     Windows out;
     for (const DerivedSeries& one : data_.series) {
       const Episode& episode = episodes_[static_cast<std::size_t>(one.episode)];
       if (episode.chosen.empty()) continue;
-      out.series.push_back(
-          {one.coordinate, one.episode, one.positions, one.model, episode.grid, {episode.chosen.begin(), episode.chosen.end()}});
+      Windows::Series& series = out.series.emplace_back(Windows::Series{
+          one.coordinate, one.episode, one.positions, one.model, episode.grid, {episode.chosen.begin(), episode.chosen.end()}});
+      if (!sensitivities.empty()) series.grid.sensitivity = sensitivity_of(one, sensitivities);
     }
     for (const int row : rows_) out.states[row + first_line] = {data_.episode[static_cast<std::size_t>(row)], time_of(row)};
     return out;
@@ -125,6 +134,30 @@ class WindowChoice {
     return episodes_[static_cast<std::size_t>(data_.episode[static_cast<std::size_t>(row)])];
   }
   [[nodiscard]] double time_of(int row) const { return time_[row] - episode_of(row).start; }
+
+  // of one series, from those of its coordinate at the rows of all episodes
+  [[nodiscard]] StateSensitivity sensitivity_of(const DerivedSeries& series,
+                                                const std::vector<StateSensitivity>& sensitivities) const {
+    const auto is_of_episode = [&](int row) { return data_.episode[static_cast<std::size_t>(row)] == series.episode; };
+    const auto first = std::ranges::find_if(rows_, is_of_episode) - rows_.begin();
+    const Index n = std::ranges::count_if(rows_, is_of_episode);
+    VectorXd times(n);
+    for (Index i = 0; i < n; ++i) times[i] = time_of(rows_[static_cast<std::size_t>(first + i)]);
+    const auto place = std::ranges::find(data_.measured, series.coordinate) - data_.measured.begin();
+    const StateSensitivity& all = sensitivities[static_cast<std::size_t>(place)];
+    StateSensitivity out{std::move(times), all.by_position.middleRows(first, n), all.by_velocity.middleRows(first, n)};
+    for (const DerivedSeries& one : data_.series) {
+      if (one.episode != series.episode) continue;
+      const auto column = std::ranges::find(data_.measured, one.coordinate) - data_.measured.begin();
+      const double noise = one.model.noise_stddev / series.model.noise_stddev;
+      out.by_position.col(column) *= noise;
+      out.by_velocity.col(column) *= noise;
+    }
+    // the accelerated coordinate first
+    out.by_position.col(0).swap(out.by_position.col(place));
+    out.by_velocity.col(0).swap(out.by_velocity.col(place));
+    return out;
+  }
 
   // windows and steps of states in periods of the frequency up to which the fastest motion of an episode stands out of the noise
   void make_grids() {
@@ -195,6 +228,62 @@ MatrixXd acting_states(const Model& model, const DerivedData& data, const CsvTab
   return states;
 }
 
+// The states with one entry of each changed by a multiple of its usual error, moved back onto the constraints, which do not let
+// the coordinates err by themselves.
+// @param stddev  as usual_errors
+MatrixXd changed_states(const System& system, const VectorXd& parameters, MatrixXd states, const MatrixXd& stddev, Index entry,
+                        double change) {
+  states.row(entry) += change * stddev.row(entry);
+  if (system.residual_labels().empty()) return states;
+  return project_states(system, parameters, states, stddev).states;
+}
+
+// About what q and dq of smoothed states are off by (2 nq × rows): the noise of the positions, and its velocities below the bandwidth.
+// What was not measured follows the rest, however far.
+MatrixXd usual_errors(const DerivedData& data, const MatrixXd& states, const std::vector<int>& rows) {
+  const Index nq = data.accelerations.rows();
+  const auto moving = states.topRows(2 * nq);
+  const VectorXd spread =
+      (moving.colwise() - moving.rowwise().mean()).rowwise().norm() / std::sqrt(static_cast<double>(rows.size()));
+  MatrixXd out = spread.replicate(1, states.cols());
+  for (const DerivedSeries& one : data.series) {
+    for (Index i = 0; i < out.cols(); ++i) {
+      if (data.episode[static_cast<std::size_t>(rows[static_cast<std::size_t>(i)])] != one.episode) continue;
+      out(one.coordinate, i) = one.model.noise_stddev;
+      out(nq + one.coordinate, i) = one.model.noise_stddev * std::numbers::pi * one.bandwidth;
+    }
+  }
+  return (out.array() > 0).select(out, not_a_number);
+}
+
+// How the accelerations that were learned change with each measured coordinate, from differences over its usual error to either side.
+// @param states  of all rows, with what acts
+// @returns of each measured coordinate, at the chosen rows
+std::vector<StateSensitivity> sensitivities_of(const Posterior& posterior, const DerivedData& data, const MatrixXd& states,
+                                               const std::vector<int>& rows) {
+  const System& system = *posterior.prior().system;
+  const Index nq = system.nq(), n_measured = std::ssize(data.measured);
+  const MatrixXd some = states(Eigen::all, rows);
+  const MatrixXd stddev = usual_errors(data, some, rows);
+  const View view = View::constrained_acceleration(system);
+  const VectorXd& parameters = posterior.values().parameters;
+  std::vector<StateSensitivity> out(data.measured.size());
+  for (StateSensitivity& one : out) one.by_position = one.by_velocity = MatrixXd::Zero(some.cols(), n_measured);
+  for (Index k = 0; k < 2 * n_measured; ++k) {
+    const bool of_position = k < n_measured;
+    const Index column = k % n_measured, entry = data.measured[static_cast<std::size_t>(column)] + (of_position ? 0 : nq);
+    const auto mean = [&](double change) {
+      return posterior.mean(view, changed_states(system, parameters, some, stddev, entry, change), 0);
+    };
+    const MatrixXd slope = (mean(1) - mean(-1)) * (0.5 * stddev.row(entry).cwiseInverse()).asDiagonal();
+    for (Index j = 0; j < n_measured; ++j) {
+      StateSensitivity& of_one = out[static_cast<std::size_t>(j)];
+      (of_position ? of_one.by_position : of_one.by_velocity).col(column) = slope.row(data.measured[static_cast<std::size_t>(j)]);
+    }
+  }
+  return out;
+}
+
 double total_gain(const DerivedData& data) {
   double gain = 0;
   for (const DerivedSeries& one : data.series) gain += one.gain;
@@ -251,7 +340,13 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     return out;
   };
   std::vector<Actuator> actuators = request.model.actuators;  // estimated anew by each fit, from where the last one found them
-  const auto smoothed_by_fit_to = [&](const LearnedLog& before) {
+  struct Learned {
+    Posterior posterior;
+    std::vector<int> lines;
+    MatrixXd states;  // of all rows, with what acts
+  };
+  std::optional<Learned> last;
+  const auto learn_from = [&](const LearnedLog& before) {
     FitRequest quick = before.request(request, log.name());
     const CsvTable whole = *quick.problem.commands;
     quick.model.actuators = actuators;
@@ -261,22 +356,41 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     const FitOutcome fit = run_fit(job, {}, stop);
     if (stop != nullptr && *stop) throw NumericalError("stopped while the raw log was learned from");
     actuators = fit.file.model.actuators;
-    return with_rows(derive(
-        request.model, log, smoothing,
-        left_out_accelerations(fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole))));
+    last = {fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole)};
+  };
+  const auto smoothed_by_fit_to = [&](const LearnedLog& before) {
+    learn_from(before);
+    return with_rows(derive(request.model, log, smoothing, left_out_accelerations(last->posterior, last->lines, last->states)));
   };
 
   const auto with_windows = [&](LearnedLog learned) {
     if (!options.windows || !learns_from_windows(request, learned.data, log)) return learned;
     const CsvTable table = as_table(learned.data, system, log.name());
     constexpr int n_values = 2 * n_window_states;  // of accelerations, that are no more than can be fitted in a minute or two
-    const int n = request.problem.max_points.value_or(
-        std::min(n_window_states, n_values / static_cast<int>(std::ssize(learned.data.independent))));
+    const auto n_independent = static_cast<int>(std::max<Index>(1, std::ssize(learned.data.independent)));
+    const int n = request.problem.max_points.value_or(std::min(n_window_states, n_values / n_independent));
     const WindowChoice choice(learned.data, system, resample(request.model, table, {.n = std::min(n, table.n_rows())}).rows, n);
     // a group of eight windows takes eighteen states: of a few groups less is learned than from as many rows, which lie apart
     if (n < n_raw_rows && !choice.covers_log()) return learned;
+    std::vector<StateSensitivity> sensitivities;
+    if (!learned.data.independent.empty()) {
+      if (!last) {
+        const std::size_t step = (learned.rows.size() + n_raw_rows - 1) / n_raw_rows;
+        for (std::size_t i = 0; i * step < learned.rows.size(); ++i) learned.rows[i] = learned.rows[i * step];
+        learned.rows.resize((learned.rows.size() + step - 1) / step);
+        learn_from(learned);
+      }
+      try {
+        sensitivities = sensitivities_of(last->posterior, learned.data, last->states, choice.rows());
+      } catch (const InputError& error) {
+        learned.notes.push_back(fmt::format(
+            "warning: errors of the smoothed states count as nothing beside the noise of windows, since accelerations "
+            "near these states are unknown: {} Standard errors may be too small; compare a fit with `windows=none`",
+            error.what()));
+      }
+    }
     learned.rows = choice.rows();
-    learned.windows = std::make_shared<const Windows>(choice.windows());
+    learned.windows = std::make_shared<const Windows>(choice.windows(sensitivities));
     for (DerivedSeries& series : learned.data.series) series.positions = std::vector<Measurement>();  // `= {}` keeps the memory
     return learned;
   };

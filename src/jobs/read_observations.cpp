@@ -210,6 +210,20 @@ void require_mechanics_at(const LoggedSystem& logged, const View& view, const Ma
                   log.name(), lower.usual, lower.states.size(), rows.size(), lower.lowest, data_row(lower.states.front())));
 }
 
+// Loads of which nothing tells whose they are, at some states.
+void note_shared_loads(const LoggedSystem& logged, const MatrixXd& states, const CsvTable& log, std::vector<std::string>& notes) {
+  constexpr Index enough = 300;
+  if (logged.system().nc() < 2 || logged.model.graph == nullptr || states.cols() == 0) return;
+  std::vector<Index> some;
+  for (Index i = 0; i < states.cols(); i += std::max<Index>(1, states.cols() / enough)) some.push_back(i);
+  MechanicsBatch mechanics;
+  evaluate_mechanics(logged.prior, View::constrained_acceleration(logged.system()), states(Eigen::all, some), logged.parameters,
+                     mechanics);
+  if (mechanics.fault) return;
+  for (const std::string& text : shared_load_texts(logged.model, logged.system(), mechanics))
+    notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
+}
+
 // Deviations of coordinates and velocities, of columns NAME_std; NaN where there are none. Empty where there is no such column.
 MatrixXd stated_state_deviations(const System& system, LogReader& reader, const CsvTable& log) {
   const std::vector<std::string> names = system.state_names();
@@ -290,18 +304,37 @@ MatrixXd all_accelerations(const System& system, LogReader& reader, const CsvTab
   return complete ? reader.measurements(every) : MatrixXd();
 }
 
+// σ of every acceleration where it is known before the fit (nq × N)
+MatrixXd known_noise(const LoggedSystem& logged, const Readings& readings, const FitProblemOptions& options) {
+  const Model::Noise& noise = logged.model.noise;
+  MatrixXd stddev = MatrixXd::Constant(logged.system().nq(), readings.states.cols(), not_a_number);
+  if (options.estimate_noise) return stddev;
+  for (Index j = 0; j < stddev.rows(); ++j) {
+    if (options.noise_stddev) {
+      stddev.row(j).setConstant(*options.noise_stddev);
+    } else if (!noise.estimate && !noise.stddev.empty()) {
+      stddev.row(j).setConstant(noise.stddev[static_cast<std::size_t>(j)]);
+    }
+  }
+  for (Index k = 0; k < readings.view.size() && readings.states_noise(); ++k) {
+    if (readings.states_noise(k)) stddev.row(readings.view.rows[static_cast<std::size_t>(k)]) = readings.stated_stddev.row(k);
+  }
+  return stddev;
+}
+
 // accelerations that follow from others are no measurements; which of them count may change from row to row
-void note_dependence(const LoggedSystem& logged, const Readings& readings, const MatrixXd& accelerations, const CsvTable& log,
-                     std::vector<std::string>& notes) {
+void note_dependence(const LoggedSystem& logged, const Readings& readings, const FitProblemOptions& options,
+                     const MatrixXd& accelerations, const CsvTable& log, std::vector<std::string>& notes) {
   if (accelerations.size() == 0) return;
   const std::vector<std::string> every = logged.system().acceleration_names();
-  const auto independent = dependent_columns(logged.system(), readings.states, logged.parameters, accelerations);
+  const auto independent = dependent_columns(logged.system(), readings.states, logged.parameters, accelerations,
+                                             known_noise(logged, readings, options));
   if (!independent || (!readings.values.array().isNaN()).colwise().count().maxCoeff() <= std::ssize(*independent)) return;
   std::vector<std::string> names;
   for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
   notes.push_back(
-      fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
-                  "measurements but {}; observe independent rows only, say `observe={}`",
+      fmt::format("warning: {}: the accelerations obey A ddq = b, or a part of it, far better than noise lets them: they are "
+                  "not {} independent measurements but {}; observe independent rows only, say `observe={}`",
                   log.name(), every.size(), independent->size(), fmt::join(names, ",")));
 }
 
@@ -546,7 +579,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
   // what is learned from windows are sums over each position by itself, not these rows
-  if (!log.windows) note_dependence(logged, readings, all_values, log.table, notes);
+  if (!log.windows) note_dependence(logged, readings, options, all_values, log.table, notes);
   keep_known(commanded, log.table, measured, notes);
   const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
   if (rows.size() < measured.size()) {
@@ -556,6 +589,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   if (static_cast<int>(rows.size()) < n_rows) readings.keep(rows);
   of_log = {lines_of(rows, log.table), of_rows(std::move(commanded), rows)};
   require_mechanics_at(logged, readings.view, readings.states, rows, log.table, notes);
+  note_shared_loads(logged, readings.states, log.table, notes);
 
   const bool model_estimates = logged.model.noise.estimate && !options.noise_stddev;
   const bool estimate = readings.states_noise()
@@ -705,6 +739,72 @@ WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const Cs
   }
   note_violation(system, out.states, parameters, log, out.notes);
   return out;
+}
+
+ActingStates::ActingStates(const Prior& prior) {
+  for (const Latent& latent : prior.latents) {
+    names_.push_back(latent.name);
+    acts_.push_back(!latent.directions);
+  }
+}
+
+void ActingStates::count(const Prior& prior, const MatrixXd& states, const VectorXd& parameters) {
+  n_states_ += states.cols();
+  if (std::ranges::count(acts_, false) == 0) return;
+  const auto fault = for_each_mechanics(
+      prior, View::constrained_acceleration(*prior.system), states, parameters, [&](Index first, const MechanicsBatch& block) {
+        const int n = block.values.n_states();
+        const PriorValues values = evaluate_prior(prior, states.middleCols(first, n), parameters, block);
+        for (std::size_t a = 0; a < acts_.size(); ++a) {
+          for (int i = 0; i < n && !acts_[a]; ++i) acts_[a] = values.fault || !values.E(a, i).isZero(0);
+        }
+      });
+  if (fault) std::fill(acts_.begin(), acts_.end(), true);  // others tell
+}
+
+std::vector<std::string> ActingStates::idle_texts() const {
+  std::vector<std::string> warnings;
+  for (std::size_t a = 0; a < acts_.size() && n_states_ > 0; ++a) {
+    if (acts_[a]) continue;
+    warnings.push_back(fmt::format(
+        "latent '{}' acts at 0 of {} states: its direction is 0 there, and nothing is learned of it; look at the sign "
+        "of its load, or at the condition under which it acts",
+        names_[a], n_states_));
+  }
+  return warnings;
+}
+
+std::vector<std::string> shared_load_texts(const Model& model, const System& system, const MechanicsBatch& mechanics) {
+  constexpr double rounding = 1e-6;
+  std::set<std::string> read;
+  for (const LatentSpec& latent : model.latents) {
+    const auto add = [&](const std::string& text) {
+      for (const std::string& variable : model.graph->variables_of(model.expression(text))) read.insert(variable);
+    };
+    if (!latent.feature_code) std::for_each(latent.features.begin(), latent.features.end(), add);
+    if (latent.direction_code) continue;
+    for (const std::vector<std::string>& row : latent.directions) std::for_each(row.begin(), row.end(), add);
+  }
+  std::vector<bool> is_shared(static_cast<std::size_t>(system.nc()), false);
+  for (int i = 0; i < mechanics.values.n_states(); ++i) {
+    const auto A = mechanics.values.A(i);
+    // the identity of independent rows
+    const MatrixXd shares = mechanics.projections[static_cast<std::size_t>(i)].multipliers_of_force() * A.transpose();
+    for (int row = 0; row < system.nc(); ++row)
+      if (!A.row(row).isZero(0) && shares(row, row) < 1 - rounding) is_shared[static_cast<std::size_t>(row)] = true;
+  }
+  std::vector<std::string> warnings;
+  for (int row = 0; row < system.nc(); ++row) {
+    for (const char* name : {"lambda0", "lambda"}) {
+      const std::string variable = fmt::format("{}({})", name, row + 1);
+      if (!is_shared[static_cast<std::size_t>(row)] || !read.contains(variable)) continue;
+      warnings.push_back(
+          fmt::format("{}: the constraint '{}' follows from others, so that nothing tells its share of the load: remove the rows "
+                      "that repeat others",
+                      variable, system.constraint_labels()[static_cast<std::size_t>(row)]));
+    }
+  }
+  return warnings;
 }
 
 std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Model& model, const CsvTable& log,

@@ -14,6 +14,11 @@ namespace gp2 {
 void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
                    const std::map<std::string, std::string>& columns);
 
+/// Names of columns for logs that are read together: those given, then the model's own [columns].
+/// @throws InputError as check_columns.
+std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
+                                                   const std::map<std::string, std::string>& columns);
+
 /// As a fit found them: nothing of them is estimated any more.
 std::vector<Actuator> found(std::vector<Actuator> actuators);
 
@@ -65,6 +70,26 @@ void note_shared_rows(const std::vector<Observations>& known, const std::vector<
 /// their column at most. Empty where nothing is.
 std::string text_of_rest(const Model& model, const Eigen::VectorXd& parameters, const Eigen::MatrixXd& states,
                          const Eigen::MatrixXd& values);
+
+/// At how many states the latents of a prior act.
+class ActingStates {
+ public:
+  explicit ActingStates(const Prior& prior);
+  /// Adds states of a system whose prior has the same latents.
+  void count(const Prior& prior, const Eigen::MatrixXd& states, const Eigen::VectorXd& parameters);
+  /// Of each latent whose direction is 0 at all of them.
+  [[nodiscard]] std::vector<std::string> idle_texts() const;
+
+ private:
+  std::vector<std::string> names_;
+  std::vector<bool> acts_;
+  Eigen::Index n_states_ = 0;
+};
+
+/// Of each multiplier that latents of a model read while its constraint follows from others: which share of the load is its own is then
+/// a choice.
+/// @param mechanics  at some states
+std::vector<std::string> shared_load_texts(const Model& model, const System& system, const MechanicsBatch& mechanics);
 
 /// The accelerations to compare predictions with where none are asked for: those that any observation of the fit has, as far as the
 /// log has them.

@@ -159,7 +159,9 @@ void independence_advice(const Report& report, std::vector<Advice>& advice) {
     if (data.independent.empty()) continue;
     advice.push_back(
         {Level::warning,
-         fmt::format("The accelerations of the {} data follow from each other: they obey the constraint to rounding.", data.name),
+         fmt::format("The accelerations of the {} data follow from each other: they obey the constraint, or a part of it, far "
+                     "better than noise lets them.",
+                     data.name),
          fmt::format("They are not independent measurements. Fit with `observe={}`.", fmt::join(data.independent, ","))});
   }
 }
@@ -244,7 +246,7 @@ void coverage_advice(const Report& report, const ReportData& data, std::vector<A
   // errors below the noise, where the noise of training is what its residuals are
   const bool is_below_noise = (e.rmse.array() < 0.7 * data.noise_stddev.rowwise().mean().array()).all();
   const bool noise_is_right = std::none_of(report.cross_validation.residuals.begin(), report.cross_validation.residuals.end(),
-                                           [](const auto& one) { return one.rms < 0.7; });
+                                           [](const auto& one) { return one.is_of_ddq && one.rms < 0.7; });
   const bool is_covered = std::isfinite(e.coverage95_latent) && std::abs(e.coverage95_latent - nominal) <= tolerance;
   const bool is_noise_free = is_covered || (is_below_noise && noise_is_right && !report.cross_validation.residuals.empty());
   if (is_noise_free && std::isfinite(e.coverage95_latent) && e.coverage95_latent < nominal - tolerance) {

@@ -1,12 +1,10 @@
 #include "gp2/jobs/report_job.hpp"
 
 #include <algorithm>
-#include <array>
 #include <chrono>
 #include <cmath>
 #include <filesystem>
 #include <limits>
-#include <numbers>
 
 #include <fmt/chrono.h>
 #include <fmt/format.h>
@@ -202,10 +200,6 @@ std::vector<Relevance> relevance_of(const Posterior& posterior) {
   }
   return all;
 }
-
-}  // namespace
-
-namespace {
 
 // The row of the training data that is nearest to the medians of what the prior reads, in spreads.
 VectorXd usual_state(const Prior& prior, const MatrixXd& states) {
@@ -424,7 +418,7 @@ std::vector<Option> options(ReportOptions& options) {
        "model file of another system with the same coordinates, inputs and latents, which `data` and `truth` are of", "", "", "",
        "data"},
       {"truth", &options.truth, "MODEL", "model file whose [truth] is the true acceleration, shown beside the prediction"},
-      {"map", &options.columns, "LOGNAME=NAME,…", "columns of `data` by other names", "", "columns"},
+      columns_option(options.columns, "columns of `data` by other names"),
   };
 }
 
@@ -477,7 +471,7 @@ std::vector<std::string> notes_of_fit(const FitFile& fit, const Posterior& poste
   if (fit.notes) return *fit.notes;
   std::vector<std::string> notes = notes_of(fit.report, posterior);
   if (fit.report.inducing) add_inducing_note(*fit.report.inducing, notes);
-  add_residual_notes(posterior, cross_validation.residuals, notes);
+  add_residual_notes(posterior, {posterior.observations()}, cross_validation.residuals, notes);
   add_stretch_note(cross_validation, notes, posterior.prior());
   const std::string correlated = correlated_text(cross_validation.residuals);
   if (!correlated.empty()) notes.push_back(correlated);

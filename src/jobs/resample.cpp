@@ -60,6 +60,17 @@ struct Features {
   }
 };
 
+// @throws InputError for what does not vary with the state, or is no function of it.
+void require_of_state(const Model& model, Expression feature) {
+  const std::vector<std::string> variables = model.graph->variables_of(feature);
+  if (variables.empty()) throw InputError("is the same at every state, and measures nothing");
+  for (const std::string& name : model.system->acceleration_names()) {
+    if (std::ranges::find(variables, name) == variables.end()) continue;
+    throw InputError(
+        fmt::format("reads {}, which is no part of the state: measure by coordinates, velocities, t and inputs", name));
+  }
+}
+
 // those asked for, with angles and parameters as the prior has them, or those of all latents of the prior
 Features features_of(const Model& model, const std::vector<std::string>& asked) {
   Features out;
@@ -74,6 +85,7 @@ Features features_of(const Model& model, const std::vector<std::string>& asked) 
     for (const std::string& name : expand_angle(written, model.system->coordinates())) {
       try {
         values.push_back(words.with_values(words.parse(name), *model.system));
+        require_of_state(model, values.back());
       } catch (const InputError& error) {
         throw InputError(fmt::format("`features`: '{}': {}", written, error.what()));
       }
@@ -103,7 +115,7 @@ std::vector<Option> options(ResampleOptions& options) {
       {"features", &options.features, "q1,dq1,…", "expressions of the model's symbols to measure by",
        "the features of the model's latents"},
       {"seed", &options.seed, "S", "start at a random row", "at the row nearest to the mean"},
-      {"map", &options.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+      columns_option(options.columns),
   };
 }
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <numbers>
 #include <numeric>
@@ -15,6 +16,7 @@
 
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
+#include "data/evenly.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/pathwise.hpp"
@@ -57,6 +59,7 @@ class Shooter {
         n_threads_(thread_count(request.threads)),
         hyperparameters_(fit.report.hyperparameters) {
     find_parameters();
+    note_rows_that_are_gone(notes_);
     read(log, request.columns, notes_);
     cut(log, request);
   }
@@ -80,7 +83,9 @@ class Shooter {
         break;
       ++out.iterations;
     }
-    const VectorXd variance = step.variance + variance_by_latents(step, weights, residuals);
+    const LatentScatter by_latents = scatter_by_latents(step, weights, residuals);
+    const VectorXd variance =
+        has_errors() ? VectorXd(step.variance + by_latents.variance) : VectorXd::Constant(std::ssize(parameters_), not_a_number);
     out.rms_after = rms_of(residuals);
     out.duration = duration_;
     out.n_stretches = static_cast<int>(stretches_.size());
@@ -95,17 +100,56 @@ class Shooter {
       if (after.at_bound()) out.notes.push_back(fmt::format("warning: {} ended at a bound", after.name));
     }
     if (!out.converged) out.notes.emplace_back("warning: the last step still changed the parameters: shorter stretches may help");
+    add_doubts(by_latents.rms, out);
     out.fit = fit_;
     out.fit.report.hyperparameters = hyperparameters_;
     out.fit.report.draws.reset();
     out.fit.report.uncertainty.reset();
     out.fit.notes.reset();
-    out.fit.report.negative_log_likelihood = posterior_at(hyperparameters_).negative_log_likelihood();
+    const Posterior found = posterior_at(hyperparameters_);
+    out.fit.report.negative_log_likelihood = found.negative_log_likelihood();
+    out.fit.take_data(found);
+    if (out.fit.report.inducing) out.fit.report.inducing->stretches.reset();  // which were of the parameters before
     out.fit.report.termination = "parameters by multiple shooting";
     return out;
   }
 
  private:
+  [[nodiscard]] bool has_errors() const { return std::ssize(stretches_) >= least_stretches; }
+
+  /// What speaks against the parameters: few stretches, motions farther off than errors of the log and of latents let them be, and a
+  /// fit that disagrees.
+  void add_doubts(const VectorXd& rms_by_latents, ShootOutcome& out) const {
+    constexpr double far = 3;  // deviations
+    std::vector<std::string> off, apart;
+    for (std::size_t c = 0; c < stated_.size(); ++c) {
+      const auto row = static_cast<Index>(c);
+      const double relative = out.rms_after[row] / std::hypot(stated_[c], rms_by_latents[row]);
+      if (relative > far) off.push_back(fmt::format("{}, {:.2g} times that", out.coordinates[c], relative));
+    }
+    for (const ShotParameter& one : out.parameters) {
+      const double difference = std::abs(one.value - one.one_step) / std::hypot(one.stddev, one.one_step_stddev);
+      if (difference > far) apart.push_back(fmt::format("{}, {:.2g} joint standard errors", one.name, difference));
+    }
+    if (!has_errors()) {
+      out.notes.push_back(fmt::format(
+          "warning: no standard errors: they come from how {} stretches or more differ. A shorter `duration` or a longer log",
+          least_stretches));
+    }
+    if (!off.empty()) {
+      out.notes.push_back(
+          fmt::format("warning: the motion stays farther off than errors of the log and of the latents let it: {}: an input, a "
+                      "column or a force is wrong, or stretches are too long",
+                      fmt::join(off, "; ")));
+    }
+    if (!apart.empty()) {
+      out.notes.push_back(
+          fmt::format("warning: the motion tells other values than the accelerations did: {}: the log is not of the machine "
+                      "that was fitted, smoothing changed its accelerations, or the model lacks something",
+                      fmt::join(apart, "; ")));
+    }
+  }
+
   void find_parameters() {
     for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
       if (hyperparameters_[k].is_system_parameter() && !hyperparameters_[k].is_fixed()) parameters_.push_back(k);
@@ -118,12 +162,26 @@ class Shooter {
     }
   }
 
+  void note_rows_that_are_gone(std::vector<std::string>& notes) const {
+    const std::vector<std::int64_t> n = fit_.n_states();
+    const std::int64_t n_all = std::accumulate(n.begin(), n.end(), std::int64_t{0});
+    if (n_all == n_states(fit_.observations)) return;
+    notes.push_back(fmt::format("warning: the file of the fit holds {} of its {} rows, and latents are learned from these alone",
+                                n_states(fit_.observations), n_all));
+  }
+
   void read(const CsvTable& log, const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
     LogReader reader = open_log(fit_.model, log, columns);
     states_ = reader.states(std::vector<bool>(static_cast<std::size_t>(system_.layout().size()), true));
     static_cast<void>(take_commands(system_, found(fit_.model.actuators), reader, std::nullopt, columns, states_, notes));
     for (int j = 0; j < system_.nq(); ++j) {
-      if (!reader.stddev_column(system_.coordinates()[static_cast<std::size_t>(j)].name).empty()) compared_.push_back(j);
+      const std::string& name = system_.coordinates()[static_cast<std::size_t>(j)].name;
+      if (reader.stddev_column(name).empty()) continue;
+      compared_.push_back(j);
+      const MatrixXd stddevs = reader.stddevs({name});
+      std::vector<double> known;
+      std::ranges::copy_if(stddevs.reshaped(), std::back_inserter(known), [](double one) { return std::isfinite(one); });
+      stated_.push_back(median(std::move(known)));
     }
     if (!compared_.empty()) return;
     compared_.resize(system_.coordinates().size());
@@ -164,7 +222,7 @@ class Shooter {
       for (Index i = first; i + size <= first + rows;) {
         const bool starts = can_start(i);
         if (starts) found.push_back({i, size, states_.col(i)});
-        i += starts ? size : 1;
+        i += starts ? size - 1 : 1;  // the row where one ends is that where the next starts
       }
     }
     if (size < least_rows || found.empty()) {
@@ -229,7 +287,9 @@ class Shooter {
   }
 
   [[nodiscard]] Posterior posterior_at(const std::vector<Hyperparameter>& hyperparameters) const {
-    return {prior_, fit_.observations, model_values(prior_, fit_.observations, hyperparameters)};
+    ModelValues values = model_values(prior_, fit_.observations, hyperparameters);
+    if (fit_.report.inducing) values.inducing = fit_.report.inducing->points;
+    return {prior_, fit_.observations, std::move(values)};
   }
 
   /// Measured less predicted positions, row after row; nothing where the motion does not reach the end.
@@ -398,11 +458,17 @@ class Shooter {
   }
 
   struct Step {
-    std::vector<MatrixXd> J;  // per stretch: weighed derivatives by θ, without what those by its start explain
-    MatrixXd inverse;         // A⁻¹, A = Σ JᵀJ
-    VectorXd variance;        // by errors that stretches do not share
+    std::vector<MatrixXd> starts;  // per stretch: orthonormal, what its start explains, weighed
+    std::vector<MatrixXd> J;       // per stretch: weighed derivatives by θ, without that
+    MatrixXd inverse;              // A⁻¹, A = Σ JᵀJ
+    VectorXd variance;             // by errors that stretches do not share
     VectorXd of_theta;
   };
+
+  /// What an orthonormal basis does not explain.
+  [[nodiscard]] static MatrixXd without(const MatrixXd& basis, const MatrixXd& values) {
+    return values - basis * (basis.transpose() * values);
+  }
 
   [[nodiscard]] Step gauss_newton(const std::vector<Linearised>& all, const VectorXd& weights) const {
     const auto p = static_cast<Index>(parameters_.size());
@@ -411,9 +477,8 @@ class Shooter {
     for (const Linearised& one : all) {
       const VectorXd w = row_weights(weights, one.residual.size());
       const Eigen::ColPivHouseholderQR<MatrixXd> qr(w.asDiagonal() * one.by_start);
-      MatrixXd J = qr.householderQ().adjoint() * (w.asDiagonal() * one.by_theta);
-      J.topRows(qr.rank()).setZero();
-      J = qr.householderQ() * J;
+      step.starts.emplace_back(qr.householderQ() * MatrixXd::Identity(w.size(), qr.rank()));
+      MatrixXd J = without(step.starts.back(), w.asDiagonal() * one.by_theta);
       A += J.transpose() * J;
       gradients.col(std::ssize(step.J)) = J.transpose() * w.cwiseProduct(one.residual);
       step.J.push_back(std::move(J));
@@ -438,26 +503,39 @@ class Shooter {
     return step;
   }
 
-  /// What is not known of the latents bends the motions of all stretches alike: the variance of the steps that motions of functions
-  /// drawn from the posterior would ask for.
-  [[nodiscard]] VectorXd variance_by_latents(const Step& step, const VectorXd& weights,
-                                             const std::vector<VectorXd>& residuals) const {
+  /// What is not known of the latents bends the motions of all stretches alike.
+  struct LatentScatter {
+    VectorXd variance;  // of the steps that motions of functions drawn from the posterior would ask for
+    VectorXd rms;       // of these motions about that of the mean, per coordinate, without what starts explain
+  };
+  [[nodiscard]] LatentScatter scatter_by_latents(const Step& step, const VectorXd& weights,
+                                                 const std::vector<VectorXd>& residuals) const {
     const Posterior posterior = posterior_at(hyperparameters_);
     const PathwiseSamples samples = sample_paths(posterior, n_samples, {.seed = 1});
     std::vector<MatrixXd> asked(stretches_.size(), MatrixXd::Zero(static_cast<Index>(parameters_.size()), n_samples));
+    std::vector<VectorXd> squares(stretches_.size(), VectorXd::Zero(weights.size()));
     parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
       const auto at = static_cast<std::size_t>(k);
+      const VectorXd w = row_weights(weights, residuals[at].size());
       for (int s = 0; s < n_samples; ++s) {
         const auto drawn = [&](const View& view, const Eigen::Ref<const MatrixXd>& x) { return samples.evaluate(s, view, x); };
         const std::optional<VectorXd> there =
             residual(drawn, posterior.values().parameters, stretches_[at], stretches_[at].start);
         if (!there) continue;
-        asked[at].col(s) = step.J[at].transpose() * row_weights(weights, there->size()).cwiseProduct(*there - residuals[at]);
+        const VectorXd change = without(step.starts[at], w.cwiseProduct(*there - residuals[at]));
+        asked[at].col(s) = step.J[at].transpose() * change;
+        squares[at] += change.cwiseQuotient(w).reshaped(weights.size(), w.size() / weights.size()).rowwise().squaredNorm();
       }
     });
     MatrixXd sum = MatrixXd::Zero(static_cast<Index>(parameters_.size()), n_samples);
-    for (const MatrixXd& one : asked) sum += one;
-    return (step.inverse * sum).rowwise().squaredNorm() / n_samples;
+    VectorXd square = VectorXd::Zero(weights.size());
+    double n_rows = 0;
+    for (std::size_t k = 0; k < stretches_.size(); ++k) {
+      sum += asked[k];
+      square += squares[k];
+      n_rows += static_cast<double>(residuals[k].size() / weights.size());
+    }
+    return {(step.inverse * sum).rowwise().squaredNorm() / n_samples, (square / (n_samples * n_rows)).cwiseSqrt()};
   }
 
   [[nodiscard]] std::vector<std::string> names() const {
@@ -495,8 +573,9 @@ class Shooter {
     return false;
   }
 
-  static constexpr Index least_rows = 8;   // of a stretch
-  static constexpr double most_steps = 5;  // usual ones, beyond which the log does not go on
+  static constexpr Index least_rows = 8;     // of a stretch
+  static constexpr int least_stretches = 4;  // for standard errors
+  static constexpr double most_steps = 5;    // usual ones, beyond which the log does not go on
   static constexpr int most_steps_per_row = 50;
   static constexpr double relative_width = 1e-3;  // of differences: in a logarithm, or in units of a size
   static constexpr int n_samples = 16;            // of the posterior, for standard deviations
@@ -511,6 +590,7 @@ class Shooter {
   std::vector<Hyperparameter> hyperparameters_;
   std::vector<std::size_t> parameters_;  // that are estimated, among the hyperparameters
   std::vector<int> compared_;            // coordinates
+  std::vector<double> stated_;           // the median deviation that the log states of each of them; empty where it states none
   MatrixXd states_;                      // of the log
   VectorXd spread_;                      // of q and dq over it (2 nq)
   std::vector<Contact> contacts_;        // at the parameters where the search starts
@@ -528,7 +608,7 @@ std::vector<Option> options(ShootRequest& request) {
            "twice the time in which velocities change by their own size; 8 rows at least, half of the longest part of the log at "
            "most"},
           {"stretches", &request.most_stretches, "K", "at most so many, evenly taken"},
-          {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+          columns_option(request.columns),
           threads_option(request.threads)};
 }
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <memory>
 #include <utility>
 
@@ -12,6 +13,7 @@
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/model_motion.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -87,7 +89,7 @@ StartingPoint start_of_log(const Model& model, const CsvTable& table, const std:
     start.given[entry] = true;
     found.push_back(names[entry]);
   }
-  if (found.empty()) {
+  if (found.empty() || found.front() == "t") {
     throw InputError(fmt::format("`start`: {} has none of the columns {}", table.name(),
                                  fmt::join(names.begin(), names.begin() + system.layout().t(), ", ")));
   }
@@ -105,20 +107,16 @@ void free_what_depends(const Model& model, const VectorXd& parameters, StartingP
   const System& system = *model.system;
   const auto violation = largest_violation(system, start.state, parameters);
   const auto n = static_cast<std::size_t>(2 * system.nq());
-  const bool is_whole =
-      std::all_of(start.given.begin(), start.given.begin() + static_cast<std::ptrdiff_t>(n), [](bool one) { return one; });
+  const bool is_whole = std::all_of(start.given.begin(), start.given.begin() + 2 * system.nq(), std::identity());
   if (!is_whole || !violation || violation->relative <= constraint_violation_tolerance) return;
   const std::vector<std::string> names = system.state_names();
   std::vector<bool> is_measured(n, false);
   for (std::size_t k = 0; k < n; ++k) {
-    is_measured[k] = std::any_of(model.sampling.begin(), model.sampling.end(),
-                                 [&](const auto& rule) { return rule.range && rule.name == names[k]; });
+    const auto is_drawn = [&](const Model::SamplingRule& rule) { return rule.range && rule.name == names[k]; };
+    is_measured[k] = model.sampling.empty() ? system.coordinates()[k % static_cast<std::size_t>(system.nq())].angle
+                                            : std::ranges::any_of(model.sampling, is_drawn);
   }
-  const auto none = [&] { return std::none_of(is_measured.begin(), is_measured.end(), [](bool one) { return one; }); };
-  for (std::size_t k = 0; k < n && model.sampling.empty(); ++k) {
-    is_measured[k] = system.coordinates()[k % static_cast<std::size_t>(system.nq())].angle;
-  }
-  if (none()) return;
+  if (std::ranges::none_of(is_measured, std::identity())) return;
   std::copy(is_measured.begin(), is_measured.end(), start.given.begin());
 }
 
@@ -200,7 +198,7 @@ std::vector<Option> options(SimulateRequest& request) {
        "onto the constraints, after each step and where states are written; off shows how far an integrator drifts"},
       {"samples", &request.n_samples, "S", "that many functions drawn from the posterior, instead of its mean", "", "n_samples"},
       {"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"},
-      {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names, in all logs together", "", "columns"},
+      columns_option(request.columns, "columns by other names, in all logs together"),
   };
 }
 

@@ -33,7 +33,7 @@ std::vector<Option> options(UpdateRequest& request) {
   return {
       {"observe", &request.observe, "ddq3,ddq6", "accelerations to learn from", "those that the fit observed"},
       {"noise_std", &request.noise_stddev, "S", "noise standard deviation of each", "as the log states it, else as in the fit"},
-      {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+      columns_option(request.columns),
       {"forget", &request.forget, "W",
        "first of all let what was learned count as a share W of it, 0 < W ≤ 1; of fits through inducing points", "1"},
       {"window", &request.window, "N", "leave the newest N rows; of exact fits", "all"}};
@@ -165,11 +165,30 @@ void note_far_rows(const VectorXd& distance, const CsvTable& log, std::vector<st
                   log.name(), n_outside, distance.size(), typical, is_other ? ". Is the unit of a column another?" : ""));
 }
 
+// How values deviate that are not what the fit predicts; empty where they are.
+// @param z  deviations from what it predicts, in units of the standard deviations, which are those of rows it has not seen
+std::string offset_text(const std::vector<double>& z) {
+  // of sound logs the rms was 1.8 at most, where friction is steep
+  constexpr double far_rms = 2, far_mean = 1, surely = 6;
+  TrainingResidual of;
+  of.n = static_cast<int>(z.size());
+  double mean = 0;
+  for (const double one : z) {
+    mean += one / of.n;
+    of.rms += one * one / of.n;
+    of.coverage95 += std::abs(one) <= 1.96 ? 1.0 / of.n : 0;
+  }
+  of.rms = std::sqrt(of.rms);
+  const bool is_offset = std::abs(mean) > far_mean && std::abs(mean) * std::sqrt(of.n) > surely;
+  const bool is_far = of.rms > far_rms && of.is_too_large();
+  return is_offset || is_far ? fmt::format("mean {:.2g}, rms {:.2g} deviations", mean, of.rms) : "";
+}
+
 // Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones.
 void note_unexpected(const Posterior& posterior, const Observations& more, const CsvTable& log, std::vector<std::string>& notes) {
   constexpr int most_states = 1000, fewest_values = 10;  // of each column
   constexpr std::int64_t fewest_learned = 30;            // fits of fewer states are sure of too much
-  constexpr double unexpected = 6, sound_share = 0.2;
+  constexpr double few = 0.2;                            // of a column's values
   constexpr double wrong = 30, wrong_far = 100;  // also by a fit that is too sure of itself, near its data and far from them
   if (posterior.n_states() < fewest_learned || more.n_data() == 0) return;
   const std::vector<int> taken = evenly_and_extreme(more, most_states);
@@ -177,9 +196,9 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   const Posterior::Marginal predicted = posterior.marginal(some.view(), some.states(), /*n_threads=*/0);
   const MatrixXd noise = with_slip(posterior, some.view(), some.states(), noise_of_values(some));
   const MatrixXd variance = predicted.stddev().cwiseAbs2() + noise.cwiseAbs2();
-  const MatrixXd z = (some.values() - predicted.mean).cwiseAbs().cwiseQuotient(variance.cwiseSqrt());
+  const MatrixXd z = (some.values() - predicted.mean).cwiseQuotient(variance.cwiseSqrt());
   // what follows a machine row by row does not wait for distances without a cause
-  if (some.n_data() < fewest_values && !(z.array() > wrong).any()) return;
+  if (some.n_data() < fewest_values && !(z.array().abs() > wrong).any()) return;
   const VectorXd distance = posterior.distance_from_data(some.view(), some.states(), /*n_threads=*/0);
   const std::vector<std::string> names = some.view().names(*posterior.prior().system);
   std::vector<std::string> others;
@@ -189,31 +208,35 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   for (Index k = 0; k < z.rows(); ++k) {
     std::vector<double> near, all;
     for (Index i = 0; i < z.cols(); ++i) {
-      if (!(z(k, i) >= 0)) continue;  // not measured
-      all.push_back(z(k, i));
+      if (std::isnan(z(k, i))) continue;  // not measured
+      all.push_back(std::abs(z(k, i)));
       if (distance[i] <= Posterior::far_from_data) near.push_back(z(k, i));
     }
-    const auto n_near = static_cast<int>(near.size());
-    const auto n_far = static_cast<int>(std::ranges::count_if(near, [](double one) { return one > unexpected; }));
-    if (n_near >= fewest_values && n_far > sound_share * n_near) {
-      others.push_back(fmt::format("{} of {} of {}", n_far, n_near, names[static_cast<std::size_t>(k)]));
+    // single values that are wrong are told below
+    const auto is_wrong = [](double one) { return std::abs(one) > wrong; };
+    if (static_cast<double>(std::ranges::count_if(near, is_wrong)) <= few * static_cast<double>(near.size()))
+      std::erase_if(near, is_wrong);
+    if (const std::string off = offset_text(near); std::ssize(near) >= fewest_values && !off.empty()) {
+      others.push_back(fmt::format("{} ({})", names[static_cast<std::size_t>(k)], off));
       continue;
     }
     // where the fit is off everywhere, single values are not told from the others
     const double usual = std::ssize(all) < fewest_values ? 1 : std::max(1.0, median(all) / median_of_normal);
     for (Index i = 0; i < z.cols(); ++i) {
-      if (!(z(k, i) > usual * (distance[i] <= Posterior::far_from_data ? wrong : wrong_far))) continue;
+      const double size = std::abs(z(k, i));
+      if (!(size > usual * (distance[i] <= Posterior::far_from_data ? wrong : wrong_far))) continue;
       ++n_wrong;
-      if (z(k, i) <= worst) continue;
-      worst = z(k, i);
+      if (size <= worst) continue;
+      worst = size;
       where = fmt::format("{}, at row {} of what is learned from it", names[static_cast<std::size_t>(k)],
                           taken[static_cast<std::size_t>(i)] + 1);
     }
   }
   if (!others.empty()) {
     notes.push_back(fmt::format(
-        "warning: {}: {} near the fit's data lie more than six deviations from what it predicts there: is a sign, a unit "
-        "or a column other than in its own logs? Else it predicts poorly; see gp2 evaluate",
+        "warning: {}: near the fit's data values lie farther from what it predicts than its deviations let them: {}: is a sign, "
+        "a unit, an offset or a column other than in its own logs, or does the machine act otherwise now? Learned from both, "
+        "deviations are too small: `window` or `forget` lets the old rows go; see gp2 evaluate",
         log.name(), fmt::join(others, ", ")));
   }
   if (n_wrong > 0) {
@@ -297,6 +320,10 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
     note_shared_rows(groups, {more}, notes);
   }
   try {
+    for (std::string& text : constraint_warnings(posterior, nullptr, log.name(), more.states(), more.view().rows, more.values(),
+                                                 noise_of_values(more))) {
+      notes.push_back(std::move(text));
+    }
     note_unexpected(posterior, more, log, notes);
   } catch (const Error&) {
     // where the old mean of latents that are not linear has no motion, the new one may have

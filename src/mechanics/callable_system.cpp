@@ -118,7 +118,7 @@ SystemValues CallableSystem::differentiate(const States& states, const Parameter
   require_parameters(parameters);
   require_parameter(index);
   if (!definition_.differentiate) {
-    SystemValues values = difference(states, parameters, index);
+    SystemValues values = difference_in_parameter(*this, states, parameters, index);
     require_finite(
         fmt::format("the difference of evaluate in '{}'", this->parameters()[static_cast<std::size_t>(index)].name).c_str(),
         values, states);
@@ -129,25 +129,6 @@ SystemValues CallableSystem::differentiate(const States& states, const Parameter
   require_finite("differentiate", values, states);
   for (int i = 0; i < values.n_states(); ++i) require_symmetry("differentiate", values, i, true);
   return values;
-}
-
-SystemValues CallableSystem::difference(const States& states, const Parameters& parameters, int index) const {
-  SystemValues sum;
-  const ParameterStep step(this->parameters()[static_cast<std::size_t>(index)], parameters[index]);
-  for (const auto& [value, weight] : step.terms()) {
-    VectorXd moved = parameters;
-    moved[index] = value;
-    const SystemValues there = evaluate(states, moved);
-    const auto add = [weight = weight](MatrixXd& to, const MatrixXd& values) {
-      if (to.size() == 0) to.setZero(values.rows(), values.cols());
-      to += weight * values;
-    };
-    add(sum.mass, there.mass);
-    add(sum.constraint_matrix, there.constraint_matrix);
-    add(sum.constraint_vector, there.constraint_vector);
-    add(sum.force, there.force);
-  }
-  return sum;
 }
 
 MatrixXd CallableSystem::residuals(const States& states, const Parameters& parameters) const {

@@ -15,6 +15,7 @@
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "mechanics/differences.hpp"
 #include "mechanics/in_blocks.hpp"
 
 namespace gp2 {
@@ -335,26 +336,23 @@ void check_parameter_derivatives(const System& system, const Ref<const MatrixXd>
     const std::scoped_lock lock(mutex);
     largest = largest.cwiseMax(here);
   });
-  VectorXd errors = VectorXd::Zero(n_parameters);
+  VectorXd errors = VectorXd::Zero(n_parameters), is_infinite = errors;
   in_blocks(states, n_threads, [&](Index, const Ref<const MatrixXd>& block) {
     const SystemValues value = system.evaluate(block, parameters);
-    VectorXd here = VectorXd::Zero(n_parameters);
+    VectorXd here = VectorXd::Zero(n_parameters), is_infinite_here = here;
     for (int p = 0; p < n_parameters; ++p) {
-      const double parameter = std::max(std::abs(parameters[p]), 1e-3);
-      // a step of ε^(1/3) balances truncation and rounding: about 1e-10 of the values is left
-      const double step = 6e-6 * parameter;
-      VectorXd above = parameters, below = parameters;
-      above[p] += step;
-      below[p] -= step;
+      const double parameter = parameters[p] != 0 ? std::abs(parameters[p]) : 1e-3;
       const SystemValues d = system.differentiate(block, parameters, p);
-      const SystemValues high = system.evaluate(block, above), low = system.evaluate(block, below);
+      const SystemValues by_differences = difference_in_parameter(system, block, parameters, p);
       for (std::size_t part = 0; part < 4; ++part) {
         const auto entries = [&](const SystemValues& of) { return parts_of(of)[part]->reshaped(); };
         // an entry that is rounding beside the others is as good as zero
         const double rounding = 1e-6 * largest(static_cast<Index>(part), p);
         for (Index k = 0; k < entries(d).size(); ++k) {
-          const double exact = entries(d)[k], difference = (entries(high)[k] - entries(low)[k]) / (above[p] - below[p]);
+          const double exact = entries(d)[k], difference = entries(by_differences)[k];
+          if (!std::isfinite(exact) && std::isfinite(entries(value)[k])) is_infinite_here[p] = 1;
           if (!std::isfinite(difference) || !std::isfinite(exact)) continue;
+          // about 1e-10 of the values is left by the step
           const double size = std::abs(exact) + rounding + 1e-4 * std::abs(entries(value)[k]) / parameter;
           here[p] = std::max(here[p], std::abs(difference - exact) / std::max(size, 1e-12));
         }
@@ -362,7 +360,16 @@ void check_parameter_derivatives(const System& system, const Ref<const MatrixXd>
     }
     const std::scoped_lock lock(mutex);
     errors = errors.cwiseMax(here);
+    is_infinite = is_infinite.cwiseMax(is_infinite_here);
   });
+  for (int p = 0; p < n_parameters; ++p) {
+    if (is_infinite[p] == 0) continue;
+    findings.push_back(
+        {Level::warning, fmt::format("derivatives of M, A, b, F in the parameters: that in '{}' is not finite where they are: it "
+                                     "cannot be estimated from its value {}",
+                                     system.parameters()[static_cast<std::size_t>(p)].name, parameters[p])});
+  }
+  if (is_infinite.minCoeff() > 0) return;
   Index at = 0;
   const double worst = errors.maxCoeff(&at);
   findings.push_back(

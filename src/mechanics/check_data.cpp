@@ -55,25 +55,25 @@ double binomial(int n, int k) {
   return value;
 }
 
-// the smallest singular value of the given rows of T, in units of the spread, over the states
-double worst_conditioning(const std::vector<MatrixXd>& scaled_T, const std::vector<int>& rows) {
+// the smallest singular value of the given rows of bases of the accelerations that are free, in units of the spread, over the states
+double worst_conditioning(const std::vector<MatrixXd>& free, const std::vector<int>& rows) {
   double worst = std::numeric_limits<double>::infinity();
-  for (const MatrixXd& T : scaled_T) {
-    const MatrixXd some = T(rows, Eigen::all);
+  for (const MatrixXd& basis : free) {
+    const MatrixXd some = basis(rows, Eigen::all);
     worst = std::min(worst, Eigen::JacobiSVD<MatrixXd>(some).singularValues().minCoeff());
   }
   return worst;
 }
 
 // `size` rows of ddq that determine the others at every state, as well-conditioned as can be found
-std::vector<int> independent_rows(const std::vector<MatrixXd>& scaled_T, int size) {
-  const int nq = static_cast<int>(scaled_T.front().rows());
+std::vector<int> independent_rows(const std::vector<MatrixXd>& free, int size) {
+  const int nq = static_cast<int>(free.front().rows());
   std::vector<int> best;
   double best_value = -1;
   constexpr double max_subsets = 2000;
   if (binomial(nq, size) <= max_subsets) {
     for_each_subset(nq, size, [&](const std::vector<int>& subset) {
-      const double value = worst_conditioning(scaled_T, subset);
+      const double value = worst_conditioning(free, subset);
       if (value > best_value) {
         best_value = value;
         best = subset;
@@ -89,7 +89,7 @@ std::vector<int> independent_rows(const std::vector<MatrixXd>& scaled_T, int siz
       if (std::find(best.begin(), best.end(), row) != best.end()) continue;
       std::vector<int> candidate = best;
       candidate.push_back(row);
-      const double value = worst_conditioning(scaled_T, candidate);
+      const double value = worst_conditioning(free, candidate);
       if (value > best_value) {
         best_value = value;
         next = row;
@@ -110,24 +110,46 @@ std::vector<int> complete_states(const Ref<const MatrixXd>& accelerations) {
   return complete;
 }
 
-// Whether A ddq = b holds to rounding wherever all accelerations are measured.
-bool obey_to_rounding(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                      const Ref<const MatrixXd>& accelerations) {
+// The combinations c of the rows of A ddq = b (nc × how many) that measured accelerations obey far better than noise lets them, or to
+// rounding: Σ (cᵀr)² < Σ cᵀ A S Aᵀ c, summed over the states, with r = A ddq − b and S the variances that are far too small for noise.
+// Combinations in which A cancels say nothing of ddq and are left out.
+MatrixXd obeyed_combinations(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                             const Ref<const MatrixXd>& accelerations, const Ref<const MatrixXd>& stddev) {
   // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
-  constexpr double tolerance = 1e-6;
-  bool obey = true;
+  constexpr double rounding = 1e-6, beside_noise = 0.03, redundant = 1e-9;
+  const int nc = system.nc();
+  const bool are_many = states.cols() >= 2 * nc + 4;  // else chance makes a small residual
+  VectorXd size = accelerations.array().square().rowwise().mean().sqrt();
+  size = size.cwiseMax(rounding * size.maxCoeff());  // a column that is 0
+  MatrixXd of_residual = MatrixXd::Zero(nc, nc), allowed = of_residual;
   in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
-    if (!obey) return;
     const SystemValues values = system.evaluate(block, parameters);
     for (int i = 0; i < values.n_states(); ++i) {
-      const auto ddq = accelerations.col(first + i);
-      if (ddq.hasNaN()) continue;
-      const VectorXd residual = values.A(i) * ddq - values.b(i);
-      const VectorXd size = values.A(i).cwiseAbs() * ddq.cwiseAbs() + values.b(i).cwiseAbs();
-      obey = obey && !((residual.array().abs() > tolerance * size.array())).any();
+      VectorXd small = rounding * size;
+      for (Index j = 0; j < small.size() && stddev.size() > 0 && are_many; ++j) {
+        const double noise = stddev(j, first + i);
+        if (std::isfinite(noise)) small[j] = std::hypot(small[j], beside_noise * noise);
+      }
+      const VectorXd residual = values.A(i) * accelerations.col(first + i) - values.b(i);
+      const MatrixXd scaled = values.A(i) * small.asDiagonal();
+      of_residual += residual * residual.transpose();
+      allowed += scaled * scaled.transpose();
     }
   });
-  return obey;
+  if (!of_residual.allFinite() || !allowed.allFinite()) return MatrixXd(nc, 0);
+  if (!are_many) {
+    of_residual = MatrixXd(of_residual.diagonal().asDiagonal());
+    allowed = MatrixXd(allowed.diagonal().asDiagonal());
+  }
+  // in combinations whose allowed variance is 1 each
+  const VectorXd unit = (allowed.diagonal().array() > 0).select(allowed.diagonal().array().rsqrt(), 0);
+  const Eigen::SelfAdjointEigenSolver<MatrixXd> of_allowed(unit.asDiagonal() * allowed * unit.asDiagonal());
+  const auto n_kept = (of_allowed.eigenvalues().array() > redundant).count();
+  if (n_kept == 0) return MatrixXd(nc, 0);  // accelerations of 0
+  const MatrixXd combinations = unit.asDiagonal() * of_allowed.eigenvectors().rightCols(n_kept) *
+                                of_allowed.eigenvalues().tail(n_kept).cwiseSqrt().cwiseInverse().asDiagonal();
+  const Eigen::SelfAdjointEigenSolver<MatrixXd> ratios(combinations.transpose() * of_residual * combinations);
+  return combinations * ratios.eigenvectors().leftCols((ratios.eigenvalues().array() < 1).count());
 }
 
 // A contact only pushes, and its gap is positive where it is open.
@@ -234,33 +256,41 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
 }
 
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
-                                                  const Ref<const VectorXd>& parameters,
-                                                  const Ref<const MatrixXd>& accelerations) {
-  if (system.nc() == 0 || !obey_to_rounding(system, states, parameters, accelerations)) return std::nullopt;
+                                                  const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& accelerations,
+                                                  const Ref<const MatrixXd>& stddev) {
+  if (system.nc() == 0) return std::nullopt;
   if (accelerations.hasNaN()) {
     const std::vector<int> complete = complete_states(accelerations);
     if (complete.empty()) return std::nullopt;
-    return dependent_columns(system, states(Eigen::all, complete), parameters, accelerations(Eigen::all, complete));
+    const MatrixXd of_complete = stddev.size() > 0 ? MatrixXd(stddev(Eigen::all, complete)) : MatrixXd();
+    return dependent_columns(system, states(Eigen::all, complete), parameters, accelerations(Eigen::all, complete), of_complete);
   }
+  const MatrixXd combinations = obeyed_combinations(system, states, parameters, accelerations, stddev);
+  if (combinations.cols() == 0) return std::nullopt;
   VectorXd scale(system.nq());
   for (Index j = 0; j < scale.size(); ++j) scale[j] = std::max(spread(accelerations.row(j)), 1e-300);
-  int rank = 0, lowest_rank = system.nq();
-  std::vector<MatrixXd> scaled_T;
   constexpr Index max_states = 50;
-  const Index stride = std::max<Index>(1, states.cols() / max_states);
-  const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
-    for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
-      const UdwadiaKalaba& projection = mechanics.projections[i];
-      rank = std::max(rank, projection.rank());
-      lowest_rank = std::min(lowest_rank, projection.rank());
-      if ((first + static_cast<Index>(i)) % stride != 0) continue;
-      scaled_T.emplace_back(scale.cwiseInverse().asDiagonal() * projection.T() * scale.asDiagonal());
+  const Index stride = system.has_conditional_constraints() ? 1 : std::max<Index>(1, states.cols() / max_states);
+  // of B ddq = Cᵀ b with B = Cᵀ A: what it leaves free, one below the other by the state
+  Index rank = 0, lowest_rank = system.nq();
+  std::vector<MatrixXd> free;
+  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
+    const SystemValues values = system.evaluate(block, parameters);
+    for (int i = 0; i < values.n_states(); ++i) {
+      if ((first + i) % stride != 0) continue;
+      Eigen::JacobiSVD<MatrixXd> svd(combinations.transpose() * values.A(i) * scale.asDiagonal(), Eigen::ComputeFullV);
+      svd.setThreshold(1e-9);
+      rank = std::max(rank, svd.rank());
+      lowest_rank = std::min(lowest_rank, svd.rank());
+      free.emplace_back(svd.matrixV().rightCols(system.nq() - svd.rank()));
     }
   });
-  if (fault || rank == 0) return std::nullopt;
+  // where the constraints leave no freedom there is nothing to measure
+  if (rank == 0 || rank == system.nq()) return std::nullopt;
   // where a constraint is not active all columns are measurements
   if (system.has_conditional_constraints() && lowest_rank < rank) return std::nullopt;
-  return independent_rows(scaled_T, system.nq() - rank);
+  std::erase_if(free, [&](const MatrixXd& one) { return one.cols() > system.nq() - rank; });
+  return independent_rows(free, system.nq() - static_cast<int>(rank));
 }
 
 bool ConstraintResidual::is_too_large() const {
@@ -273,6 +303,13 @@ bool ConstraintResidual::is_too_large() const {
   const double scatter = std::sqrt(std::max(0.0, rms * rms - mean * mean));
   const bool is_offset = std::abs(mean) > scatter && std::abs(mean) * std::sqrt(n) > 6 * scatter && std::abs(mean) > 0.05 * size;
   return is_offset || rms > 0.5 * size;
+}
+
+bool ConstraintResidual::is_too_small() const {
+  if (!(n > 0 && std::isfinite(expected))) return false;
+  // χ²/n of n normal values is above this but once in 30000 (Wilson & Hilferty 1931)
+  const double least = 1 - 2.0 / (9 * n) - 4 * std::sqrt(2.0 / (9 * n));
+  return rms < 0.5 * expected && least > 0 && rms * rms < std::pow(least, 3) * expected * expected;
 }
 
 std::string ConstraintResidual::text() const {
@@ -353,7 +390,7 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
 
 std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                 const Ref<const MatrixXd>& accelerations, const Ref<const MatrixXd>& stddev,
-                                const std::vector<int>& stated) {
+                                const std::vector<int>& stated, bool estimates_noise) {
   const bool estimates =
       std::any_of(system.parameters().begin(), system.parameters().end(), [](const auto& one) { return one.estimate; });
   std::vector<Finding> findings;
@@ -365,11 +402,21 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
                         fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
                                     violation->value, violation->relative, violation->constraint, violation->state + 1)});
   }
+  MatrixXd told = stddev;
+  for (int row = 0; row < system.nq() && estimates_noise; ++row) {
+    if (std::find(stated.begin(), stated.end(), row) == stated.end()) told.row(row).setConstant(not_a_number);
+  }
+  const auto rows = dependent_columns(system, states, parameters, accelerations, told);
   for (const ConstraintResidual& one : constraint_residuals(system, states, parameters, accelerations, stddev)) {
     // as large as what should cancel: nothing that is learned from such data is of this system
     const bool is_all = one.is_too_large() && one.rms > 0.3 * one.size && !estimates;
-    const std::string of_file = one.is_too_large() && estimates ? "; here with the parameters as in the model file" : "";
-    findings.push_back({is_all ? Level::error : one.is_too_large() ? Level::warning : Level::good, one.text() + of_file});
+    std::string text = one.text();
+    if (one.is_too_large() && estimates) text += "; here with the parameters as in the model file";
+    if (one.is_too_small() && !rows && !estimates_noise) {
+      text +=
+          fmt::format(": {:.2g} ×; the noise is stated too large, or these columns share their errors", one.rms / one.expected);
+    }
+    findings.push_back({is_all ? Level::error : one.is_too_large() ? Level::warning : Level::good, std::move(text)});
   }
   if (const auto* symbolic = dynamic_cast<const SymbolicSystem*>(&system)) {
     check_contacts(*symbolic, states, parameters, accelerations, findings);
@@ -379,18 +426,18 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
     for (const int row : some) names.push_back(every[static_cast<std::size_t>(row)]);
     return names;
   };
-  const auto rows = dependent_columns(system, states, parameters, accelerations);
   // which of them a fit observes may change from row to row
   const auto most_stated = [&] { return (!stddev(stated, Eigen::all).array().isNaN()).colwise().count().maxCoeff(); };
   if (rows && !stated.empty() && most_stated() <= std::ssize(*rows)) {
     findings.push_back(
-        {Level::good, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding; a fit observes "
-                                  "{}, whose deviations the log gives",
-                                  system.nq(), fmt::join(names_of(stated), ", "))});
+        {Level::good,
+         fmt::format("dependent columns: the {} accelerations obey A ddq = b, or a part of it, far better than noise "
+                     "lets them; a fit observes {}, whose deviations the log gives",
+                     system.nq(), fmt::join(names_of(stated), ", "))});
   } else if (rows) {
     findings.push_back(
-        {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
-                                     "independent measurements: fit with `observe={}`",
+        {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b, or a part of it, far better than "
+                                     "noise lets them, so only {} of them are independent measurements: fit with `observe={}`",
                                      system.nq(), rows->size(), fmt::join(names_of(*rows), ","))});
   }
   return findings;

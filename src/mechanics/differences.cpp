@@ -80,6 +80,26 @@ ParameterStep::ParameterStep(const Parameter& parameter, double p) {
   terms_ = {{p, -3 / (2 * h)}, {p + h, 2 / h}, {p + 2 * h, -1 / (2 * h)}};
 }
 
+SystemValues difference_in_parameter(const System& system, const Ref<const MatrixXd>& states,
+                                     const Ref<const VectorXd>& parameters, int index) {
+  SystemValues sum;
+  const ParameterStep step(system.parameters()[static_cast<std::size_t>(index)], parameters[index]);
+  for (const auto& [value, weight] : step.terms()) {
+    VectorXd moved = parameters;
+    moved[index] = value;
+    const SystemValues there = system.evaluate(states, moved);
+    const auto add = [weight = weight](MatrixXd& to, const MatrixXd& values) {
+      if (to.size() == 0) to.setZero(values.rows(), values.cols());
+      to += weight * values;
+    };
+    add(sum.mass, there.mass);
+    add(sum.constraint_matrix, there.constraint_matrix);
+    add(sum.constraint_vector, there.constraint_vector);
+    add(sum.force, there.force);
+  }
+  return sum;
+}
+
 std::vector<bool> marks_of(const std::optional<std::vector<std::string>>& read, const char* what, const System& system) {
   const std::vector<std::string> names = system.state_names();
   if (!read) return std::vector<bool>(names.size(), true);

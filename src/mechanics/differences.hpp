@@ -50,6 +50,10 @@ class ParameterStep {
   std::vector<Term> terms_;
 };
 
+/// ∂M/∂p, ∂A/∂p, ∂b/∂p, ∂F/∂p by differences over such a step, of p = parameters()[index].
+SystemValues difference_in_parameter(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                     const Eigen::Ref<const Eigen::VectorXd>& parameters, int index);
+
 /// Which entries of a state have these names; all where none are given.
 /// @param what  stands for the list in messages
 /// @throws InputError naming one that is none of the state's.

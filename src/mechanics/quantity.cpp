@@ -21,55 +21,50 @@ namespace {
 
 const Coordinate& coordinate(const System& system, int row) { return system.coordinates()[static_cast<std::size_t>(row)]; }
 
+// A quantity that is one part of the motion, as it stands there.
+template <MotionColumns::Columns MotionColumns::*part>
+class PartOfMotion : public QuantityKind {
+ public:
+  void evaluate(const StateMechanics& /*at*/, const MotionColumns& motion, Ref<MatrixXd> out, Workspace& /*w*/) const override {
+    out = motion.*part;
+  }
+  void differentiate(const StateMechanics& /*at*/, const MotionColumns& /*motion*/, const MotionColumns& dmotion,
+                     const ConstraintChange& /*dA*/, Ref<MatrixXd> out, Workspace& /*w*/) const override {
+    out = dmotion.*part;
+  }
+
+ protected:
+  constexpr PartOfMotion() = default;
+  constexpr ~PartOfMotion() = default;
+  PartOfMotion(const PartOfMotion&) = default;
+  PartOfMotion& operator=(const PartOfMotion&) = default;
+};
+
 // ddq
-class ConstrainedAcceleration final : public QuantityKind {
+class ConstrainedAcceleration final : public PartOfMotion<&MotionColumns::constrained_acceleration> {
  public:
   [[nodiscard]] std::string word() const override { return "constrained"; }
   [[nodiscard]] std::string name(const System& system, int row) const override { return coordinate(system, row).acceleration(); }
   [[nodiscard]] MotionParts parts() const override { return {.constrained_acceleration = true}; }
   [[nodiscard]] bool is_acceleration() const override { return true; }
-
-  void evaluate(const StateMechanics& /*at*/, const MotionColumns& motion, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = motion.constrained_acceleration;
-  }
-  void differentiate(const StateMechanics& /*at*/, const MotionColumns& /*motion*/, const MotionColumns& dmotion,
-                     const ConstraintChange& /*dA*/, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = dmotion.constrained_acceleration;
-  }
 };
 
 // ā
-class UnconstrainedAcceleration final : public QuantityKind {
+class UnconstrainedAcceleration final : public PartOfMotion<&MotionColumns::unconstrained_acceleration> {
  public:
   [[nodiscard]] std::string word() const override { return "unconstrained"; }
   [[nodiscard]] std::string name(const System& system, int row) const override { return "abar_" + coordinate(system, row).name; }
   [[nodiscard]] MotionParts parts() const override { return {.unconstrained_acceleration = true}; }
   [[nodiscard]] bool is_acceleration() const override { return true; }
-
-  void evaluate(const StateMechanics& /*at*/, const MotionColumns& motion, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = motion.unconstrained_acceleration;
-  }
-  void differentiate(const StateMechanics& /*at*/, const MotionColumns& /*motion*/, const MotionColumns& dmotion,
-                     const ConstraintChange& /*dA*/, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = dmotion.unconstrained_acceleration;
-  }
 };
 
 // Aᵀλ
-class ConstraintForce final : public QuantityKind {
+class ConstraintForce final : public PartOfMotion<&MotionColumns::constraint_force> {
  public:
   [[nodiscard]] std::string word() const override { return "constraint-force"; }
   [[nodiscard]] std::string name(const System& system, int row) const override { return "fc_" + coordinate(system, row).name; }
   [[nodiscard]] MotionParts parts() const override { return {.constraint_force = true}; }
   [[nodiscard]] double per_acceleration(double mass, double /*time_step*/) const override { return mass; }
-
-  void evaluate(const StateMechanics& /*at*/, const MotionColumns& motion, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = motion.constraint_force;
-  }
-  void differentiate(const StateMechanics& /*at*/, const MotionColumns& /*motion*/, const MotionColumns& dmotion,
-                     const ConstraintChange& /*dA*/, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = dmotion.constraint_force;
-  }
 };
 
 // λ = K Aᵀλ with K = (Aᵀ)⁺, of minimum norm where rows are redundant
@@ -137,21 +132,13 @@ class NextVelocity final : public QuantityKind {
 };
 
 // M'(ā − μ): the applied force that the latents add
-class LearnedForce final : public QuantityKind {
+class LearnedForce final : public PartOfMotion<&MotionColumns::applied_force> {
  public:
   [[nodiscard]] std::string word() const override { return "force"; }
   [[nodiscard]] std::string name(const System& system, int row) const override { return "force_" + coordinate(system, row).name; }
   [[nodiscard]] MotionParts parts() const override { return {.applied_force = true}; }
   [[nodiscard]] bool has_mean() const override { return false; }
   [[nodiscard]] double per_acceleration(double mass, double /*time_step*/) const override { return mass; }
-
-  void evaluate(const StateMechanics& /*at*/, const MotionColumns& motion, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = motion.applied_force;
-  }
-  void differentiate(const StateMechanics& /*at*/, const MotionColumns& /*motion*/, const MotionColumns& dmotion,
-                     const ConstraintChange& /*dA*/, Ref<MatrixXd> out, Workspace& /*w*/) const override {
-    out = dmotion.applied_force;
-  }
 };
 
 // constant-initialised: objects of other files may hold them before main

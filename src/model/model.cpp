@@ -33,7 +33,24 @@ std::string read_text(const std::filesystem::path& path) {
   return read_file(path, max_model_size);
 }
 
-Model parse_model(std::string text, std::string name, const ModelCode& code, const RobotSource& robot) {
+// a robot's file stands beside the model's
+RobotSource beside(const std::string& model_name) {
+  return
+      [folder = std::filesystem::path(model_name).parent_path()](const std::string& file) { return read_robot(folder / file); };
+}
+
+}  // namespace
+
+Model Model::read(const std::filesystem::path& path, const ModelCode& code) {
+  return parse(read_text(path), path.string(), code);
+}
+
+Model Model::parse(std::string text, std::string name, const ModelCode& code) {
+  const RobotSource robot = beside(name);
+  return parse(std::move(text), std::move(name), robot, code);
+}
+
+Model Model::parse(std::string text, std::string name, const RobotSource& robot, const ModelCode& code) {
   Model model;
   model.code = code;
   model.name = std::move(name);
@@ -58,38 +75,6 @@ Model parse_model(std::string text, std::string name, const ModelCode& code, con
     throw InputError(fmt::format("{}: {}", model.name, error.what()));
   }
   return model;
-}
-
-}  // namespace
-
-Model Model::read(const std::filesystem::path& path) { return parse(read_text(path), path.string()); }
-
-Model Model::read(const std::filesystem::path& path, const ModelCode& code) {
-  return parse(read_text(path), path.string(), code);
-}
-
-namespace {
-
-// a robot's file stands beside the model's
-RobotSource beside(const std::string& model_name) {
-  return
-      [folder = std::filesystem::path(model_name).parent_path()](const std::string& file) { return read_robot(folder / file); };
-}
-
-}  // namespace
-
-Model Model::parse(std::string text, std::string name) {
-  const RobotSource robot = beside(name);
-  return parse_model(std::move(text), std::move(name), {}, robot);
-}
-
-Model Model::parse(std::string text, std::string name, const RobotSource& robot, const ModelCode& code) {
-  return parse_model(std::move(text), std::move(name), code, robot);
-}
-
-Model Model::parse(std::string text, std::string name, const ModelCode& code) {
-  const RobotSource robot = beside(name);
-  return parse_model(std::move(text), std::move(name), code, robot);
 }
 
 Model Model::from_code(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents) {

@@ -141,10 +141,15 @@ std::vector<std::size_t> positions_by_use(const std::vector<std::pair<std::strin
   value.fail(text + name);
 }
 
-std::string robot_number_name(std::string written) {
-  std::replace(written.begin(), written.end(), '\'', '"');
-  std::erase(written, ' ');
-  return written;
+std::string robot_number_name(std::string_view written) {
+  std::string name;
+  bool is_in_quotes = false;  // where the names of bodies and joints stand, which may have spaces
+  for (const char c : written) {
+    const bool is_quote = c == '"' || c == '\'';
+    if (is_quote) is_in_quotes = !is_in_quotes;
+    if (c != ' ' || is_in_quotes) name += is_quote ? '"' : c;
+  }
+  return name;
 }
 
 RobotNames robot_names(const Model& model) {

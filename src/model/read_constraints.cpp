@@ -89,7 +89,8 @@ void read_contact(const ModelReader& reader, Level level, const TomlValue& entry
   const bool is_taken = std::any_of(system.constraints.begin(), system.constraints.end(),
                                     [&](const ConstraintRow& one) { return one.contact && one.contact->input == index; });
   if (is_taken) contact->fail(fmt::format("'{}' is another contact's input: each needs its own", name));
-  if (!reader.model.actuators[static_cast<std::size_t>(index)].is_direct()) {
+  const Actuator& actuator = reader.model.actuators[static_cast<std::size_t>(index)];
+  if (!actuator.is_direct() || actuator.is_estimated()) {
     contact->fail(fmt::format("'{}' is a contact, which has neither a delay nor a lag: remove them", name));
   }
   const std::string condition = name + " > 0.5";

@@ -5,6 +5,7 @@
 #include <optional>
 #include <set>
 #include <string>
+#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -113,6 +114,6 @@ std::vector<std::size_t> positions_by_use(const std::vector<std::pair<std::strin
                                           const std::vector<std::vector<std::string>>& words, const char* fault);
 
 /// mass('link7') as the number of a robot is called: mass("link7").
-std::string robot_number_name(std::string written);
+std::string robot_number_name(std::string_view written);
 
 }  // namespace gp2

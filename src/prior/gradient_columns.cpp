@@ -23,10 +23,6 @@ bool has_gradient(const Kernel& kernel) {
   });
 }
 
-double GradientColumns::amplitude(const Kernel::Term& term) const {
-  return term.amplitude < 0 ? 1 : columns_->values()[term.amplitude] * columns_->values()[term.amplitude];
-}
-
 Map<const ArrayXd> GradientColumns::inverse_lengthscales(const Kernel::Term& term) const {
   return {columns_->scales().data() + term.factors.front().first_column, n_features()};
 }
@@ -77,7 +73,7 @@ void GradientColumns::evaluate(Index first, Index n, const VectorXd& point, Work
         term.k3 = term.k1;
         break;
     }
-    const double square = amplitude(terms[k]);
+    const double square = columns_->amplitude(terms[k]);
     if (square == 1) continue;
     for (ArrayXd* slope : {&term.k1, &term.k2, &term.k3}) *slope *= square;
     if (factor.primitive != Primitive::rq) continue;
@@ -86,49 +82,43 @@ void GradientColumns::evaluate(Index first, Index n, const VectorXd& point, Work
   }
 }
 
-void GradientColumns::multiply(const Ref<const VectorXd>& loading, Workspace& w) const {
+template <typename Visit>
+void GradientColumns::for_each_term(const Workspace& w, const Visit& visit) const {
   const std::vector<Kernel::Term>& terms = columns_->kernel().terms();
+  for (std::size_t k = 0; k < terms.size(); ++k) visit(terms[k], w.terms[k], inverse_lengthscales(terms[k]));
+}
+
+void GradientColumns::multiply(const Ref<const VectorXd>& loading, Workspace& w) const {
   const Index n = w.half_square.size(), D = n_features();
   w.out.setZero(n, D);
-  w.along.resize(n);
-  for (std::size_t k = 0; k < terms.size(); ++k) {
-    const Workspace::Term& term = w.terms[k];
-    const Map<const ArrayXd> inverse = inverse_lengthscales(terms[k]);
+  for_each_term(w, [&](const Kernel::Term&, const Workspace::Term& term, const Map<const ArrayXd>& inverse) {
     // k₂ δᵀΛ^{1/2}ℓ
-    w.along.setZero();
+    w.along.setZero(n);
     for (Index d = 0; d < D; ++d) w.along += term.delta.col(d) * (inverse[d] * loading[d]);
     w.along *= term.k2;
     for (Index d = 0; d < D; ++d) {
       w.out.col(d) += inverse[d] * (term.k1 * (inverse[d] * loading[d]) + w.along * term.delta.col(d));
     }
-  }
+  });
 }
 
 void GradientColumns::add_sums(const Ref<const MatrixXd>& beta, Ref<VectorXd> sums, Workspace& w) const {
-  const std::vector<Kernel::Term>& terms = columns_->kernel().terms();
   const Index n = w.half_square.size(), D = n_features();
-  w.along.resize(n);
-  for (std::size_t k = 0; k < terms.size(); ++k) {
-    const Workspace::Term& term = w.terms[k];
-    const Map<const ArrayXd> inverse = inverse_lengthscales(terms[k]);
-    w.along.setZero();
+  for_each_term(w, [&](const Kernel::Term&, const Workspace::Term& term, const Map<const ArrayXd>& inverse) {
+    w.along.setZero(n);
     for (Index d = 0; d < D; ++d) w.along += term.delta.col(d) * beta.col(d).array() * inverse[d];
     w.along *= term.k2;
     for (Index d = 0; d < D; ++d) {
       sums[d] += inverse[d] * (term.k1 * beta.col(d).array() * inverse[d] + w.along * term.delta.col(d)).sum();
     }
-  }
+  });
 }
 
 // With b = Λ^{1/2}β, t = δᵀb and δ = Λ^{1/2}(φ_i − φ'): the sums are Λ^{1/2}Σ(k₁b + k₂ t δ), and dδ = −Λ^{1/2}dφ', ds = −δᵀΛ^{1/2}dφ'.
 void GradientColumns::add_derivative(const Ref<const MatrixXd>& beta, Ref<MatrixXd> derivative, Workspace& w) const {
-  const std::vector<Kernel::Term>& terms = columns_->kernel().terms();
   const Index n = w.half_square.size(), D = n_features();
-  w.along.resize(n);
-  for (std::size_t k = 0; k < terms.size(); ++k) {
-    const Workspace::Term& term = w.terms[k];
-    const Map<const ArrayXd> inverse = inverse_lengthscales(terms[k]);
-    w.along.setZero();
+  for_each_term(w, [&](const Kernel::Term&, const Workspace::Term& term, const Map<const ArrayXd>& inverse) {
+    w.along.setZero(n);
     for (Index d = 0; d < D; ++d) w.along += term.delta.col(d) * beta.col(d).array() * inverse[d];
     const double trace = (term.k2 * w.along).sum();
     for (Index e = 0; e < D; ++e) {
@@ -140,19 +130,16 @@ void GradientColumns::add_derivative(const Ref<const MatrixXd>& beta, Ref<Matrix
         derivative(d, e) -= inverse[d] * inverse[e] * (sum + (d == e ? trace : 0));
       }
     }
-  }
+  });
 }
 
 // With u and z scaled by Λ^{1/2}: k₁ uᵀz + k₂ (uᵀδ)(zᵀδ). Each of u_d, z_d and δ_d goes with 1/ℓ_d, and ds/dlog ℓ_d = −δ_d².
 void GradientColumns::add_gradient(const Ref<const MatrixXd>& u, const Ref<const VectorXd>& loading, Ref<VectorXd> gradient,
                                    Workspace& w) const {
-  const std::vector<Kernel::Term>& terms = columns_->kernel().terms();
   const Index n = w.half_square.size(), D = n_features();
   w.scaled.resize(n, D);
-  for (std::size_t k = 0; k < terms.size(); ++k) {
-    const Workspace::Term& term = w.terms[k];
-    const Kernel::Factor& factor = terms[k].factors.front();
-    const Map<const ArrayXd> inverse = inverse_lengthscales(terms[k]);
+  for_each_term(w, [&](const Kernel::Term& of_kernel, const Workspace::Term& term, const Map<const ArrayXd>& inverse) {
+    const Kernel::Factor& factor = of_kernel.factors.front();
     const ArrayXd z = inverse * loading.array();
     ArrayXd &u_delta = w.along, &z_delta = w.across, &u_z = w.product;
     u_delta.setZero(n);
@@ -174,17 +161,15 @@ void GradientColumns::add_gradient(const Ref<const MatrixXd>& u, const Ref<const
     if (factor.primitive == Primitive::rq) {
       gradient[factor.first_parameter + D] += (term.k1_alpha * u_z + term.k2_alpha * u_delta * z_delta).sum();
     }
-    if (terms[k].amplitude >= 0) gradient[terms[k].amplitude] += 2 * (term.k1 * u_z + term.k2 * u_delta * z_delta).sum();
-  }
+    if (of_kernel.amplitude >= 0) gradient[of_kernel.amplitude] += 2 * (term.k1 * u_z + term.k2 * u_delta * z_delta).sum();
+  });
 }
 
 void GradientColumns::of_function(Workspace& w) const {
-  const std::vector<Kernel::Term>& terms = columns_->kernel().terms();
   w.out.setZero(w.half_square.size(), n_features());
-  for (std::size_t k = 0; k < terms.size(); ++k) {
-    const Map<const ArrayXd> inverse = inverse_lengthscales(terms[k]);
-    for (Index d = 0; d < n_features(); ++d) w.out.col(d) -= inverse[d] * w.terms[k].k1 * w.terms[k].delta.col(d);
-  }
+  for_each_term(w, [&](const Kernel::Term&, const Workspace::Term& term, const Map<const ArrayXd>& inverse) {
+    for (Index d = 0; d < n_features(); ++d) w.out.col(d) -= inverse[d] * term.k1 * term.delta.col(d);
+  });
 }
 
 // 2 (k(0) − k(s))
@@ -212,7 +197,7 @@ double GradientColumns::variance_of_difference(const Ref<const VectorXd>& differ
         of_term = -2 * std::expm1(-square / 2);
         break;
     }
-    variance += amplitude(term) * of_term;
+    variance += columns_->amplitude(term) * of_term;
   }
   return variance;
 }
@@ -221,7 +206,7 @@ VectorXd GradientColumns::variance() const {
   VectorXd variance = VectorXd::Zero(n_features());
   for (const Kernel::Term& term : columns_->kernel().terms()) {
     const double k1 = term.factors.front().primitive == Primitive::matern52 ? 5.0 / 3.0 : 1;
-    variance.array() += amplitude(term) * k1 * inverse_lengthscales(term).square();
+    variance.array() += columns_->amplitude(term) * k1 * inverse_lengthscales(term).square();
   }
   return variance;
 }

@@ -68,7 +68,9 @@ class GradientColumns {
 
  private:
   [[nodiscard]] Eigen::Map<const Eigen::ArrayXd> inverse_lengthscales(const Kernel::Term& term) const;
-  [[nodiscard]] double amplitude(const Kernel::Term& term) const;
+  /// visit(term of the kernel, of the workspace, its inverse lengthscales) for every term.
+  template <typename Visit>
+  void for_each_term(const Workspace& w, const Visit& visit) const;
 
   const KernelColumns* columns_;
 };

@@ -89,6 +89,13 @@ FactorColumn KernelColumns::column_of(const Kernel::Factor& factor, Index first,
           values_.data() + factor.first_parameter};
 }
 
+namespace {
+
+// where the values of a term's factor stand
+double* of_factor(double* memory, Index n, std::size_t f) { return memory + (static_cast<Index>(f) + 2) * n; }
+
+}  // namespace
+
 double* KernelColumns::columns(Workspace& workspace, Index n) const {
   // one per factor, two more, and a row of features
   const std::size_t size = static_cast<std::size_t>(n * (max_factors_ + 2) + kernel_.n_features());
@@ -132,35 +139,35 @@ double KernelColumns::variance(const VectorXd& point) const {
 void KernelColumns::evaluate_factors(const Kernel::Term& term, Index first, Index n, const VectorXd& point, const double* k,
                                      double* memory) const {
   if (is_squared_exponential_) {
-    std::copy_n(k, n, memory + 2 * n);
+    std::copy_n(k, n, of_factor(memory, n, 0));
     return;
   }
   for (std::size_t f = 0; f < term.factors.size(); ++f) {
-    column_of(term.factors[f], first, n, point).evaluate(memory + (static_cast<Index>(f) + 2) * n, memory);
+    column_of(term.factors[f], first, n, point).evaluate(of_factor(memory, n, f), memory);
+  }
+}
+
+void KernelColumns::weigh(const Kernel::Term& term, std::size_t f, Index n, const double* w, double* memory) const {
+  Map<ArrayXd> weight(memory, n);
+  weight = amplitude(term) * Map<const ArrayXd>(w, n);
+  for (std::size_t other = 0; other < term.factors.size(); ++other) {
+    if (other != f) weight *= Map<const ArrayXd>(of_factor(memory, n, other), n);
   }
 }
 
 void KernelColumns::add_gradient(Index first, Index n, const VectorXd& point, const double* k, const double* w, MatrixXd& sums,
                                  Workspace& workspace) const {
   double* const memory = columns(workspace, n);
-  Map<ArrayXd> weight(memory, n);
-  const auto value = [&](std::size_t f) { return Map<ArrayXd>(memory + (static_cast<Index>(f) + 2) * n, n); };
-  const Map<const ArrayXd> given(w, n);
   for (const Kernel::Term& term : kernel_.terms()) {
     evaluate_factors(term, first, n, point, k, memory);
     for (std::size_t f = 0; f < term.factors.size(); ++f) {
-      // product rule: the weight of one factor carries all the others
-      weight = amplitude(term) * given;
-      for (std::size_t other = 0; other < term.factors.size(); ++other) {
-        if (other != f) weight *= value(other);
-      }
-      column_of(term.factors[f], first, n, point)
-          .add_gradient(value(f).data(), weight.data(), sums.data() + term.factors[f].first_parameter * sums.rows(), memory + n);
+      weigh(term, f, n, w, memory);
+      double* const sums_of_factor = sums.data() + term.factors[f].first_parameter * sums.rows();
+      column_of(term.factors[f], first, n, point).add_gradient(of_factor(memory, n, f), memory, sums_of_factor, memory + n);
     }
     if (term.amplitude >= 0) {
-      weight = 2 * amplitude(term) * given;
-      for (std::size_t f = 0; f < term.factors.size(); ++f) weight *= value(f);
-      sums(0, term.amplitude) += weight.sum();
+      weigh(term, term.factors.size(), n, w, memory);  // by all of them
+      sums(0, term.amplitude) += 2 * Map<const ArrayXd>(memory, n).sum();
     }
   }
 }
@@ -170,19 +177,14 @@ void KernelColumns::differentiate(Index first, Index n, const VectorXd& point, c
   const Index n_features = kernel_.n_features();
   double* const memory = columns(workspace, n);
   double* const row = memory + n * (max_factors_ + 2);
-  Map<ArrayXd> weight(memory, n);
-  const auto value = [&](std::size_t f) { return Map<ArrayXd>(memory + (static_cast<Index>(f) + 2) * n, n); };
   std::fill_n(out, n_features * m, 0.0);
   for (const Kernel::Term& term : kernel_.terms()) {
     evaluate_factors(term, first, n, point, k, memory);
     for (Index l = 0; l < m; ++l) {
       for (std::size_t f = 0; f < term.factors.size(); ++f) {
-        weight = amplitude(term) * Map<const ArrayXd>(W + l * ldw, n);
-        for (std::size_t other = 0; other < term.factors.size(); ++other) {
-          if (other != f) weight *= value(other);
-        }
+        weigh(term, f, n, W + l * ldw, memory);
         column_of(term.factors[f], first, n, point)
-            .add_point_gradient(value(f).data(), weight.data(), scales_.data() + term.factors[f].first_column,
+            .add_point_gradient(of_factor(memory, n, f), memory, scales_.data() + term.factors[f].first_column,
                                 out + l * n_features, memory + n, row);
       }
     }

@@ -44,6 +44,8 @@ class KernelColumns {
   /// What a feature is multiplied by there, of each column (n_scaled()).
   [[nodiscard]] const Eigen::VectorXd& scales() const { return scales_; }
   [[nodiscard]] bool is_squared_exponential() const { return is_squared_exponential_; }
+  /// What the product of a term's factors is multiplied by.
+  [[nodiscard]] double amplitude(const Kernel::Term& term) const;
 
   /// Memory of the functions below; one per thread.
   struct Workspace {
@@ -71,11 +73,12 @@ class KernelColumns {
  private:
   [[nodiscard]] FactorColumn column_of(const Kernel::Factor& factor, Eigen::Index first, Eigen::Index n,
                                        const Eigen::VectorXd& point) const;
-  [[nodiscard]] double amplitude(const Kernel::Term& term) const;
   double* columns(Workspace& workspace, Eigen::Index n) const;
   // the values of a term's factors into columns 2, 3, … of the memory
   void evaluate_factors(const Kernel::Term& term, Eigen::Index first, Eigen::Index n, const Eigen::VectorXd& point,
                         const double* k, double* memory) const;
+  // w and, by the product rule, all of a term but its factor f, into column 0 of that memory
+  void weigh(const Kernel::Term& term, std::size_t f, Eigen::Index n, const double* w, double* memory) const;
 
   Kernel kernel_;
   Eigen::MatrixXd features_;  // (n_rows × D)

@@ -19,6 +19,7 @@ namespace gp2 {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
+using Eigen::VectorXd;
 
 namespace {
 
@@ -60,7 +61,7 @@ class LatentMaker {
     latent.base = latent.is_potential ? Latent::Base::force : options_.base.value_or(spec.base);
     latent.lengthscale = spec.lengthscale;
     latent.signal_stddev = spec.signal_stddev;
-    latent.is_positive = spec.is_positive;
+    latent.is_positive = spec.is_positive && !options_.base;  // which it is along directions of its own
     set_features(spec, latent);
     const std::string& by_default = latent.is_potential ? potential_kernel : options_.kernel;
     latent.kernel =
@@ -132,23 +133,22 @@ class LatentMaker {
   }
 
   /// @param unit  of each feature; null: 1
-  void set_features(const LatentSpec& spec, Latent& latent, const Eigen::VectorXd* unit = nullptr) {
+  void set_features(const LatentSpec& spec, Latent& latent, const VectorXd* unit = nullptr) {
     if (spec.feature_code) {
       latent.feature_names = spec.features;
       StateCode code = spec.feature_code;
       latent.is_of_place.assign(spec.features.size(), code.reads && is_of_place(*code.reads));
-      if (unit != nullptr) {
-        code.evaluate = [of = code.evaluate, unit = *unit](const auto& states, const auto& parameters) -> MatrixXd {
-          return of(states, parameters).array().colwise() / unit.array();
+      VectorXd centre = VectorXd::Zero(latent.n_features());
+      for (Index d = 0; unit == nullptr && d < centre.size(); ++d)
+        centre[d] = centre_of(spec, latent.feature_names[static_cast<std::size_t>(d)]);
+      if (unit != nullptr || !centre.isZero(0)) {
+        const VectorXd scale = unit != nullptr ? *unit : VectorXd::Ones(centre.size());
+        code.evaluate = [of = code.evaluate, centre, scale](const auto& states, const auto& parameters) -> MatrixXd {
+          MatrixXd values = of(states, parameters);
+          // of another shape it is refused by CodeFunction
+          if (values.rows() == centre.size()) values = (values.colwise() - centre).array().colwise() / scale.array();
+          return values;
         };
-      } else {
-        Eigen::VectorXd centre(latent.n_features());
-        for (Index d = 0; d < centre.size(); ++d) centre[d] = centre_of(spec, spec.features[static_cast<std::size_t>(d)]);
-        if (!centre.isZero(0)) {
-          code.evaluate = [of = code.evaluate, centre](const auto& states, const auto& parameters) -> MatrixXd {
-            return of(states, parameters).colwise() - centre;
-          };
-        }
       }
       latent.features = std::make_shared<CodeFunction>(std::move(code), fmt::format("latent '{}': features", spec.name),
                                                        latent.n_features(), system_);

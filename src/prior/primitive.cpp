@@ -35,10 +35,6 @@ std::span<const Kind> parameter_kinds(Primitive primitive) {
   }
 }
 
-bool is_stationary(Primitive primitive) {
-  return primitive != Primitive::periodic && primitive != Primitive::linear && primitive != Primitive::constant;
-}
-
 double feature_scale(Primitive primitive, const double* v, Index n_features, Index d) {
   return primitive == Primitive::periodic ? std::numbers::pi / v[n_features + d] : 1 / v[d];
 }
@@ -79,6 +75,15 @@ void add_frequency(Primitive primitive, const double* v, RandomStream& random, V
   const double spread = spectral_spread(primitive, v, n, random);
   for (Index d = 0; d < n; ++d) frequency[d] += spread * random.normal() / v[d];
 }
+
+namespace {
+
+// whether it depends on r² alone
+bool is_stationary(Primitive primitive) {
+  return primitive != Primitive::periodic && primitive != Primitive::linear && primitive != Primitive::constant;
+}
+
+}  // namespace
 
 void FactorColumn::squared_distance(double* r2) const { simd::loops().squared_distance(n, n_features, x, stride, p, r2); }
 

@@ -17,9 +17,6 @@ std::span<const std::string_view> primitive_names();
 /// What parameters it has, in their order: of those that are of a feature (see Kernel::Parameter) one for each feature.
 std::span<const Kernel::ParameterKind> parameter_kinds(Kernel::Primitive primitive);
 
-/// Whether it depends on r² alone.
-bool is_stationary(Kernel::Primitive primitive);
-
 /// What a feature of it is multiplied by.
 /// @param v  its parameters
 double feature_scale(Kernel::Primitive primitive, const double* v, Eigen::Index n_features, Eigen::Index d);
@@ -38,8 +35,6 @@ struct FactorColumn {
 
   /// The factor's value, with √3 r or √5 r of a Matérn kernel left in `distance`.
   void evaluate(double* out, double* distance) const;
-  /// −2 dk/d(r²) of a stationary factor of value k, times w.
-  void weighted_slope(const double* k, const double* w, double* slope) const;
   /// Adds Σ_i w_i ∂k_i/∂log v for the factor's parameters; column v of `sums` begins at sums + v · lanes.
   void add_gradient(const double* k, const double* w, double* sums, double* scratch) const;
   /// out_d += scale_d Σ_i w_i ∂k_i/∂p_d, p the scaled features of the point.
@@ -50,6 +45,8 @@ struct FactorColumn {
   [[nodiscard]] double shape() const { return values[n_features]; }  // α of rq
   [[nodiscard]] auto delta(Eigen::Index d) const { return Eigen::Map<const Eigen::ArrayXd>(x + d * stride, n) - p[d]; }
   void squared_distance(double* r2) const;
+  // −2 dk/d(r²) of a factor of r² alone and of value k, times w
+  void weighted_slope(const double* k, const double* w, double* slope) const;
 };
 
 }  // namespace gp2

@@ -29,11 +29,17 @@ MatrixXd stacked(const Ref<const MatrixXd>& above, const Ref<const MatrixXd>& be
   return all;
 }
 
+// B(x, λ), where the multipliers are given and it reads them; else null
+const StateFunction* of_multipliers(const Latent& latent, const MatrixXd* multipliers) {
+  return multipliers && latent.directions ? latent.directions->of_multipliers() : nullptr;
+}
+
 // B(x) or B(x, λ) at N states
 MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, Index nq,
                        const MatrixXd* multipliers) {
-  const StateFunction* const of_multipliers = multipliers && latent.directions ? latent.directions->of_multipliers() : nullptr;
-  if (of_multipliers != nullptr) return of_multipliers->evaluate(stacked(states, *multipliers), parameters);
+  if (const StateFunction* const B = of_multipliers(latent, multipliers)) {
+    return B->evaluate(stacked(states, *multipliers), parameters);
+  }
   if (latent.directions) return latent.directions->evaluate(states, parameters);
   const MatrixXd identity = MatrixXd::Identity(nq, nq);
   return identity.reshaped().replicate(1, states.cols());
@@ -191,10 +197,10 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    const StateFunction* const of_multipliers = multipliers && latent.directions ? latent.directions->of_multipliers() : nullptr;
-    MatrixXd dE = of_multipliers != nullptr ? of_multipliers->differentiate(stacked(states, *multipliers), parameters, index)
-                  : latent.directions       ? latent.directions->differentiate(states, parameters, index)
-                                            : MatrixXd::Zero(values.directions[a].rows(), n_states);
+    const StateFunction* const B = of_multipliers(latent, multipliers);
+    MatrixXd dE = B != nullptr        ? B->differentiate(stacked(states, *multipliers), parameters, index)
+                  : latent.directions ? latent.directions->differentiate(states, parameters, index)
+                                      : MatrixXd::Zero(values.directions[a].rows(), n_states);
     // E = M⁻¹B: dE = M⁻¹(dB − dM E)
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
-#include <limits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -12,7 +11,6 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
-#include "gp2/error.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "report/assets.hpp"

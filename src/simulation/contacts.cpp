@@ -49,8 +49,10 @@ std::vector<int> gap_residuals(const System& system, const std::vector<Contact>&
   const std::vector<System::Residual>& labels = system.residual_labels();
   std::vector<int> residuals;
   for (const Contact& contact : contacts) {
-    const auto is_gap = [&](const System::Residual& one) { return one.row == contact.row && !one.velocity; };
-    const auto gap = std::find_if(labels.begin(), labels.end(), is_gap);
+    const auto is_gap = [&](const System::Residual& one, const System::Residual& next) {
+      return one.row == contact.row && next.row == contact.row && !one.velocity && next.velocity;
+    };
+    const auto gap = std::adjacent_find(labels.begin(), labels.end(), is_gap);
     if (gap == labels.end() || contact.input < 0 || contact.input >= system.layout().nu) {
       throw InputError(
           fmt::format("simulate: the contact of row {} of A needs a position-level constraint and one of the {} inputs",

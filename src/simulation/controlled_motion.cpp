@@ -147,7 +147,7 @@ VectorXd start_of(const Model& model) {
 
 }  // namespace
 
-MatrixXd generate_motion(const Model& model, int n, RandomStream& random) {
+DrivenMotion generate_motion(const Model& model, int n, RandomStream& random) {
   const System& system = *model.system;
   const StateLayout layout = system.layout();
   const VectorXd parameters = system.parameter_values();
@@ -155,22 +155,24 @@ MatrixXd generate_motion(const Model& model, int n, RandomStream& random) {
 
   VectorXd state = start_of(model);
   Controller controller(model, state, random);
-  MatrixXd states(layout.size(), n);
+  SimulateOptions step;
+  step.times.resize(2);
+  step.switching = switching_functions(model, /*of_latents=*/false);
+  step.initial_step = 1 / model.motion->rate;
+  DrivenMotion motion{MatrixXd(layout.size(), n), MatrixXd(layout.nq, n)};
   for (int i = 0; i < n; ++i) {
     state[layout.t()] = i / model.motion->rate;
     state.tail(layout.nu) = controller.inputs(state);
     if (!state.allFinite())
       throw NumericalError(fmt::format("{}: [motion]: the inputs are not finite at sample {}", model.name, i + 1));
-    states.col(i) = state;
-    if (i + 1 == n) break;
-    SimulateOptions step;
-    step.times.resize(2);
+    motion.states.col(i) = state;
     step.times << state[layout.t()], (i + 1) / model.motion->rate;
     step.inputs = InputSignal(step.times, state.tail(layout.nu).replicate(1, 2));
-    step.initial_step = 1 / model.motion->rate;
-    state = simulate(system, parameters, acceleration, state, step).states.col(1);
+    const Trajectory moved = simulate(system, parameters, acceleration, state, step);
+    motion.accelerations.col(i) = moved.accelerations.col(0);
+    state = moved.states.col(1);
   }
-  return states;
+  return motion;
 }
 
 }  // namespace gp2

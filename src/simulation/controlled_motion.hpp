@@ -5,8 +5,12 @@
 
 namespace gp2 {
 
-/// The states (layout size × n) of n consecutive samples of a model's [motion]: its [truth] moves under a controller that knows
-/// its F only.
+struct DrivenMotion {
+  Eigen::MatrixXd states;         // (layout size × n)
+  Eigen::MatrixXd accelerations;  // of its [truth] there; where dry friction holds a body those of rest (nq × n)
+};
+
+/// n consecutive samples of a model's [motion]: its [truth] moves under a controller that knows its F only.
 ///
 /// The task y(q) follows straight lines between random targets. Where a target ends the next begins. At each sample the
 /// controller asks for ÿ = ÿ_r + 2 ζ ω (ẏ_r − ẏ) + ω² (y_r − y); the acceleration that gives it on the constraints, and otherwise
@@ -17,6 +21,6 @@ namespace gp2 {
 /// and its inputs are the smallest u, with the smallest λ, for which M ddq* = F(u) + Aᵀλ. They are held until the next sample.
 ///
 /// @throws NumericalError when the motion cannot go on.
-Eigen::MatrixXd generate_motion(const Model& model, int n, RandomStream& random);
+DrivenMotion generate_motion(const Model& model, int n, RandomStream& random);
 
 }  // namespace gp2

@@ -16,6 +16,7 @@
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/simulate.hpp"
 #include "mechanics/known_multipliers.hpp"
 #include "simulation/controlled_motion.hpp"
 
@@ -390,11 +391,6 @@ MatrixXd grid_states(const Model& model, const Sampler& sampler, const std::map<
   return states;
 }
 
-// a motion knows its whole state
-std::vector<bool> every_entry(const System& system) {
-  return std::vector<bool>(static_cast<std::size_t>(system.layout().size()), true);
-}
-
 GeneratedData draw_states(const Model& model, const GenerateOptions& options, RandomStream& random) {
   const Sampler sampler(model);
   GeneratedData data;
@@ -422,6 +418,12 @@ GeneratedData generate(const Model& model, const GenerateOptions& options) {
   if (model.motion && !options.grid.empty()) {
     throw InputError(fmt::format("{}: a grid is of the ranges of [sampling], but this model has [motion]", model.name));
   }
+  if (model.motion && !contacts_of(model, system.parameter_values()).empty()) {
+    throw InputError(fmt::format(
+        "{}: [motion] looks for no contact, so that a body would pass through its surface: draw states by [sampling], "
+        "or simulate a motion",
+        model.name));
+  }
   require_truth(model);
   if (options.n < 1) throw InputError(fmt::format("generate: n must be at least 1, got {}", options.n));
   if (options.noise_stddev.size() != system.nq() || !(options.noise_stddev.array() >= 0).all() ||
@@ -430,8 +432,18 @@ GeneratedData generate(const Model& model, const GenerateOptions& options) {
   }
 
   RandomStream random(options.seed);
-  GeneratedData data = model.motion ? GeneratedData{generate_motion(model, options.n, random), {}, every_entry(system)}
-                                    : draw_states(model, options, random);
+  GeneratedData data;
+  MatrixXd held;  // what dry friction adds where it holds a driven body at rest, at which sign(0) = 0
+  if (model.motion) {
+    DrivenMotion motion = generate_motion(model, options.n, random);
+    if (switching_functions(model, /*of_latents=*/false).size() > 0) {
+      held = motion.accelerations - true_acceleration(model, motion.states);
+    }
+    data.states = std::move(motion.states);
+    data.known.assign(static_cast<std::size_t>(system.layout().size()), true);
+  } else {
+    data = draw_states(model, options, random);
+  }
   // noise comes last, so that states are the same for any noise
   MatrixXd noise = MatrixXd::Zero(system.nq(), data.states.cols()), slip;
   for (Index i = 0; i < noise.cols(); ++i) {
@@ -444,6 +456,7 @@ GeneratedData generate(const Model& model, const GenerateOptions& options) {
     for (double& one : slip.reshaped()) one = random.normal();
   }
   data.accelerations = true_acceleration(model, data.states, slip) + noise;
+  if (held.size() > 0) data.accelerations += held;
   return data;
 }
 

@@ -158,7 +158,7 @@ class Integration {
       try {
         write(next, t_, x_, dxdt_);
         out_.times[next++] = t_;
-      } catch (const InputError&) {
+      } catch (const Error&) {
         // there is nothing to record where there is no motion
       }
     }

@@ -156,8 +156,9 @@ bool Switching::is_let_go(const VectorXd& state, const Acceleration& acceleratio
 }
 
 VectorXd Switching::margins(const VectorXd& state, const Acceleration& acceleration) {
-  static_cast<void>(this->acceleration(state, acceleration));
   VectorXd out = VectorXd::Ones(functions_.size());
+  if (is_empty()) return out;
+  static_cast<void>(this->acceleration(state, acceleration));
   Index next = 0;
   for (const int k : sliding()) out[k] = 1 - std::abs(sigma_[next++]);
   return out;

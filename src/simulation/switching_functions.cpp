@@ -1,5 +1,4 @@
 #include <algorithm>
-#include <array>
 #include <cstdint>
 #include <optional>
 #include <set>
@@ -12,6 +11,7 @@
 #include "gp2/model.hpp"
 #include "gp2/simulate.hpp"
 #include "mechanics/known_multipliers.hpp"
+#include "symbolic/graph.hpp"
 
 namespace gp2 {
 
@@ -50,28 +50,21 @@ void SwitchingFunctions::evaluate(const Eigen::Ref<const VectorXd>& state, const
 
 namespace {
 
-constexpr bool is_binary(Operation operation) {
-  constexpr std::array binary = {Operation::add,    Operation::subtract, Operation::multiply,
-                                 Operation::divide, Operation::power,    Operation::atan2,
-                                 Operation::min,    Operation::max,      Operation::multiply_or_zero};
-  return std::find(binary.begin(), binary.end(), operation) != binary.end();
-}
-
 // The surfaces at which expressions jump: arguments of sign(), and those whose length is a denominator, |v| or √(v² + w²), that read a
 // velocity and no input, each once and each factor by itself, without constants: sign(v), sign(−2 v), sign(lambda(1) v) and v/|v| are
-// of one surface.
+// of one surface, as are sign(v − w) and sign(w − v).
 class JumpsOf {
  public:
   JumpsOf(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
 
   void add(Expression e) {
-    if (!seen_.insert(e.id()).second || e.operation() <= Operation::variable) return;
+    if (!seen_.insert(e.id()).second || internal::is_leaf(e.operation())) return;
     if (e.operation() == Operation::sign) add_factors(e.left());
     if (e.operation() == Operation::divide && e.right().operation() == Operation::abs) add_factors(e.right().left());
     if (e.operation() == Operation::divide && e.right().operation() == Operation::sqrt) add_length(e.right().left());
     if (e.operation() == Operation::power && e.right().is_constant(-0.5)) add_length(e.left());
     add(e.left());
-    if (is_binary(e.operation())) add(e.right());
+    if (internal::is_binary(e.operation())) add(e.right());
   }
   [[nodiscard]] const std::vector<std::vector<Expression>>& found() const { return found_; }
 
@@ -143,8 +136,15 @@ class JumpsOf {
            std::none_of(symbols_.u.begin(), symbols_.u.end(), reads);
   }
 
+  // a − b and b − a are 0 together
+  static bool is_same(const Expression& g, const Expression& h) {
+    const bool are_differences = g.operation() == Operation::subtract && h.operation() == Operation::subtract;
+    return g == h || (are_differences && g.left() == h.right() && g.right() == h.left());
+  }
+
   void add_surface(std::vector<Expression> functions) {
-    if (std::find(found_.begin(), found_.end(), functions) == found_.end()) found_.push_back(std::move(functions));
+    const auto is_it = [&](const std::vector<Expression>& one) { return std::ranges::equal(one, functions, is_same); };
+    if (std::ranges::none_of(found_, is_it)) found_.push_back(std::move(functions));
   }
 
   ExpressionGraph& graph_;

@@ -40,11 +40,9 @@ Index rank_of(const MatrixXd& A) { return A.size() == 0 ? 0 : decomposition_of(A
 MatrixXd null_space(const MatrixXd& A) {
   const Index n = A.cols();
   if (A.rows() == 0 || n == 0) return MatrixXd::Identity(n, n);
-  const Eigen::ColPivHouseholderQR<MatrixXd> qr = [&] {
-    Eigen::ColPivHouseholderQR<MatrixXd> decomposition;
-    decomposition.setThreshold(rank_tolerance);
-    return decomposition.compute(A.transpose());
-  }();
+  Eigen::ColPivHouseholderQR<MatrixXd> qr;
+  qr.setThreshold(rank_tolerance);
+  qr.compute(A.transpose());
   return (qr.householderQ() * MatrixXd::Identity(n, n)).rightCols(n - qr.rank());
 }
 
@@ -71,17 +69,17 @@ std::vector<int> joined(std::vector<int> some, const std::vector<int>& more) {
   return some;
 }
 
-std::vector<int> read_positions(const System& system, const std::vector<int>& among) {
-  std::vector<int> out;
-  for (const int j : among) {
+std::vector<int> read_positions(const System& system, std::vector<int> among) {
+  std::erase_if(among, [&](int j) {
     const auto entry = static_cast<std::size_t>(system.layout().q(j));
-    if (system.reads(SystemPart::mechanics)[entry] || system.reads(SystemPart::force)[entry] ||
-        system.reads(SystemPart::residuals)[entry]) {
-      out.push_back(j);
-    }
-  }
-  return out;
+    const auto is_read = [&](SystemPart part) -> bool { return system.reads(part)[entry]; };
+    return !is_read(SystemPart::mechanics) && !is_read(SystemPart::force) && !is_read(SystemPart::residuals);
+  });
+  return among;
 }
+
+// code need not bear a NaN where it reads nothing
+VectorXd without_blind(const VectorXd& state) { return state.array().isNaN().select(0, state); }
 
 }  // namespace
 
@@ -94,13 +92,12 @@ ConstrainedStates::ConstrainedStates(const Model& model, std::vector<int> measur
       blind_(others(system_.nq(), joined(measured_, seen_))),
       held_(held_entries(system_, measured_, blind_)),
       projection_(system_, parameters_, held_) {
-  for (const System::Residual& label : system_.residual_labels()) {
+  for (std::size_t k = 0; k < system_.residual_labels().size(); ++k) {
+    const System::Residual& label = system_.residual_labels()[k];
     (label.velocity ? velocity_rows_ : position_rows_).push_back(label.row);
+    (label.velocity ? velocity_residuals_ : position_residuals_).push_back(static_cast<int>(k));
   }
 }
-
-// code need not bear a NaN where it reads nothing
-MatrixXd ConstrainedStates::without_blind(const MatrixXd& states) const { return states.array().isNaN().select(0, states); }
 
 VectorXd ConstrainedStates::completed_acceleration(const VectorXd& state, VectorXd acceleration) const {
   const SystemValues values = system_.evaluate(state, parameters_);
@@ -122,27 +119,21 @@ void ConstrainedStates::complete(VectorXd& state, Eigen::Ref<VectorXd> accelerat
 void ConstrainedStates::approach(VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
   if (free_.empty()) return;
   state = without_blind(state);
-  const auto first_residual = [&](bool velocity) {
-    const MatrixXd all = system_.residuals(state, parameters_);
-    VectorXd some(static_cast<Index>((velocity ? velocity_rows_ : position_rows_).size()));
-    Index next = 0;
-    for (std::size_t k = 0; k < system_.residual_labels().size(); ++k) {
-      if (system_.residual_labels()[k].velocity == velocity) some[next++] = all(static_cast<Index>(k), 0);
-    }
-    return some;
+  const auto residuals = [&](const std::vector<int>& which) -> VectorXd {
+    return system_.residuals(state, parameters_)(which, 0);
   };
   constexpr int max_iterations = 50;
   constexpr double close = 1e-12;
   for (int iteration = 0; iteration < max_iterations && !seen_.empty() && !position_rows_.empty(); ++iteration) {
     const MatrixXd A = system_.evaluate(state, parameters_).A(0);
-    const VectorXd step = decomposition_of(A(position_rows_, seen_)).solve(first_residual(false));
+    const VectorXd step = decomposition_of(A(position_rows_, seen_)).solve(residuals(position_residuals_));
     if (!step.allFinite()) break;
     state(seen_) -= step;  // coordinates come first in a state
     if (step.cwiseAbs().maxCoeff() <= close * (1 + state(seen_).cwiseAbs().maxCoeff())) break;
   }
   if (!velocity_rows_.empty()) {
     const MatrixXd A = system_.evaluate(state, parameters_).A(0);
-    const VectorXd step = decomposition_of(A(velocity_rows_, free_)).solve(first_residual(true));
+    const VectorXd step = decomposition_of(A(velocity_rows_, free_)).solve(residuals(velocity_residuals_));
     for (std::size_t k = 0; k < free_.size(); ++k) state[system_.layout().dq(free_[k])] -= step[static_cast<Index>(k)];
   }
   acceleration = completed_acceleration(state, acceleration);
@@ -196,10 +187,8 @@ ConstrainedStates::Linearisation ConstrainedStates::linearise(const VectorXd& st
   const SystemValues values = system_.evaluate(states, parameters_);
   MatrixXd residuals(n_position + n_velocity + nc, states.cols());
   const MatrixXd off = system_.residuals(states, parameters_);
-  Index position = 0, velocity = n_position;
-  for (std::size_t k = 0; k < system_.residual_labels().size(); ++k) {
-    residuals.row(system_.residual_labels()[k].velocity ? velocity++ : position++) = off.row(static_cast<Index>(k));
-  }
+  residuals.topRows(n_position) = off(position_residuals_, Eigen::all);
+  residuals.middleRows(n_position, n_velocity) = off(velocity_residuals_, Eigen::all);
   for (Index i = 0; i < states.cols(); ++i) {
     residuals.col(i).tail(nc) = values.A(static_cast<int>(i)) * acceleration - values.b(static_cast<int>(i));
   }

@@ -64,15 +64,15 @@ class ConstrainedStates {
     Eigen::MatrixXd jacobian;
   };
   [[nodiscard]] Linearisation linearise(const Eigen::VectorXd& state, const Eigen::VectorXd& acceleration) const;
-  [[nodiscard]] Eigen::MatrixXd without_blind(const Eigen::MatrixXd& states) const;
 
   const System& system_;
   Eigen::VectorXd parameters_;
   std::vector<int> measured_, free_;
-  std::vector<int> seen_;                           // the other free positions
-  std::vector<int> blind_;                          // free positions that nothing reads
-  std::vector<int> position_rows_, velocity_rows_;  // of A, of the residuals in their order
-  std::vector<bool> held_;                          // entries of the state
+  std::vector<int> seen_;                                     // the other free positions
+  std::vector<int> blind_;                                    // free positions that nothing reads
+  std::vector<int> position_residuals_, velocity_residuals_;  // numbers among the system's residuals
+  std::vector<int> position_rows_, velocity_rows_;            // rows of A, of these
+  std::vector<bool> held_;                                    // entries of the state
   ConstraintProjection projection_;
 };
 

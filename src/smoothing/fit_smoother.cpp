@@ -452,7 +452,9 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
   constexpr std::size_t most_fitted = 20'000;
   constexpr double as_much = 0.5;
   const std::vector<Measurement> part = excerpt(measurements, most_fitted);
-  const bool is_long = part.size() < measurements.size() && spread_of(part) > as_much * rough.signal_stddev;
+  const bool is_long = part.size() < measurements.size() &&
+                       std::ranges::count(part, false, &Measurement::velocity) >= least_positions &&
+                       spread_of(part) > as_much * rough.signal_stddev;
   const bool is_known = options.model.has_value() || is_long;
   SmootherFit fit;
   if (options.model) {

@@ -36,6 +36,13 @@ Eigen::Matrix<double, D, D> triangular_root(const Eigen::Matrix<double, D, C>& M
   return S;
 }
 
+/// ∫ g² = 1 of g(s) = √intensity s^(D−1) e^(−s) / (D − 1)!
+inline double matern_intensity(int D) {
+  double intensity = 2;
+  for (int k = 1; k < D; ++k) intensity *= 4.0 * k * k / ((2.0 * k) * (2.0 * k - 1));
+  return intensity;
+}
+
 /// A Matérn process of order ν = D − ½ as the linear stochastic differential equation dx/dτ = F x + e w, x = (q, q′, …), in the
 /// time τ = √(2ν) t / ℓ and of unit variance: white noise through 1/(1 + d/dτ)^D.
 template <int D>
@@ -67,17 +74,13 @@ class MaternMotion {
     // the spectrum is 1/(1 + ω²)^D up to a factor: E ω^(2m) = E ω^(2m−2) (2m − 1)/(2D − 2m − 1)
     Vector moments = Vector::Ones();
     for (int m = 1; m < D; ++m) moments[m] = moments[m - 1] * (2 * m - 1) / (2 * D - 2 * m - 1);
-    Matrix stationary = Matrix::Zero();
+    stationary_.setZero();
     for (int i = 0; i < D; ++i) {
-      for (int j = i % 2; j < D; j += 2) stationary(i, j) = ((i - j) / 2 % 2 == 0 ? 1 : -1) * moments[(i + j) / 2];
+      for (int j = i % 2; j < D; j += 2) stationary_(i, j) = ((i - j) / 2 % 2 == 0 ? 1 : -1) * moments[(i + j) / 2];
     }
-    stationary_ = stationary;
-    stationary_root_ = stationary.llt().matrixL();
+    stationary_root_ = stationary_.llt().matrixL();
 
-    // ∫ g₀² = 1 with g₀ = √intensity s^(D−1) e^(−s) / (D − 1)!
-    double intensity = 2;
-    for (int k = 1; k < D; ++k) intensity *= 4.0 * k * k / ((2.0 * k) * (2.0 * k - 1));
-    root_intensity_ = std::sqrt(intensity);
+    root_intensity_ = std::sqrt(matern_intensity(D));
   }
 
   [[nodiscard]] const Matrix& F() const { return F_; }

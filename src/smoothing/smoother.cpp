@@ -177,12 +177,9 @@ class Filter {
         smoothed.root = triangular_root<D, 3 * D>(columns);
       }
       const Eigen::Matrix3Xd root = smoothed.root.template topRows<n_outputs>();
-      Eigen::Vector3d mean = smoothed.mean.template head<n_outputs>();
-      Eigen::Matrix3d covariance = root * root.transpose();
       const Eigen::Map<const Eigen::Vector3d> unit(unit_.data());
-      mean = mean.cwiseProduct(unit).eval();
-      covariance = (unit.asDiagonal() * covariance * unit.asDiagonal()).eval();
-      write(k, mean, covariance);
+      const Eigen::Matrix3d covariance = root * root.transpose();
+      write(k, smoothed.mean.template head<n_outputs>().cwiseProduct(unit), unit.asDiagonal() * covariance * unit.asDiagonal());
     }
   }
 
@@ -309,19 +306,16 @@ const std::vector<std::string>& smoothness_words() {
 }
 
 std::optional<Smoothness> smoothness_of(const std::string& word) {
-  if (word == "5/2") return Smoothness::matern52;
-  if (word == "7/2") return Smoothness::matern72;
-  if (word == "9/2") return Smoothness::matern92;
-  return std::nullopt;
+  const auto found = std::find(smoothness_words().begin(), smoothness_words().end(), word);
+  if (found == smoothness_words().end()) return std::nullopt;
+  return static_cast<Smoothness>(2 + (found - smoothness_words().begin()));
 }
 
 double bandwidth_of(const SmootherModel& model, double time_step) {
   // where the spectrum of the motion, s² c/λ / (1 + (ω/λ)²)^D, sinks into that of the noise, σ² Δt
   const int D = static_cast<int>(model.smoothness) + 1;
   const double rate = std::sqrt(2.0 * D - 1) / model.lengthscale;
-  double intensity = 2;
-  for (int k = 1; k < D; ++k) intensity *= 4.0 * k * k / ((2.0 * k) * (2.0 * k - 1));
-  const double ratio = std::pow(model.signal_stddev / model.noise_stddev, 2) * intensity / (rate * time_step);
+  const double ratio = std::pow(model.signal_stddev / model.noise_stddev, 2) * matern_intensity(D) / (rate * time_step);
   return ratio > 1 ? rate * std::sqrt(std::pow(ratio, 1.0 / D) - 1) / (2 * std::numbers::pi) : 0;
 }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <utility>
 
 #include <Eigen/Cholesky>
 
@@ -12,11 +13,24 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-double WindowGrid::weight(int window, double time) const {
-  const double x = std::abs((time - begin(window)) / spacing - 2);
+namespace {
+
+// The cubic B-spline of the knots −2 … 2, and its derivative.
+double spline(double x) {
+  x = std::abs(x);
   if (x >= 2) return 0;
   return x >= 1 ? std::pow(2 - x, 3) / 6 : 2.0 / 3 - x * x + x * x * x / 2;
 }
+
+double spline_slope(double x) {
+  const double size = std::abs(x);
+  if (size >= 2) return 0;
+  return size >= 1 ? -std::copysign(std::pow(2 - size, 2) / 2, x) : -2 * x + 1.5 * x * size;
+}
+
+}  // namespace
+
+double WindowGrid::weight(int window, double time) const { return spline((time - begin(window)) / spacing - 2); }
 
 namespace {
 
@@ -116,14 +130,83 @@ VectorXd weights_of_states(const Samples& samples, const Window& window, const V
   return weights;
 }
 
+// What a sum is off by, as weights of the noise of positions first, first + 1, …: of its own coordinate, and of each other one.
+struct NoiseWeights {
+  Index first = 0;
+  MatrixXd weights;  // (positions × measured)
+};
+
+// Σ_i w_i (∂ddq/∂q φ(t_i − t_k) + ∂ddq/∂dq φ'(t_i − t_k)) h_k, what the errors of the states make of a sum: a smoother passes what is
+// below its bandwidth, as the spline φ does, whose knots are half a spacing apart.
+NoiseWeights weights_of_errors(const Samples& samples, const WindowGrid& grid, const VectorXd& times, const VectorXd& weights) {
+  const double knots = grid.spacing / 2;
+  const auto range_of = [&](double from, double to) {
+    const auto first = std::upper_bound(samples.time.begin(), samples.time.end(), from);
+    return std::pair(first - samples.time.begin(), std::lower_bound(first, samples.time.end(), to) - samples.time.begin());
+  };
+  const auto has_weight = [](double one) { return one != 0; };
+  const auto first_state = std::find_if(weights.begin(), weights.end(), has_weight) - weights.begin();
+  Index last_state = weights.size() - 1;
+  while (last_state > first_state && weights[last_state] == 0) --last_state;
+  const auto [begin, end] = range_of(times[first_state] - 2 * knots, times[last_state] + 2 * knots);
+  NoiseWeights out{begin, MatrixXd::Zero(end - begin, grid.sensitivity.by_position.cols())};
+  const StateSensitivity& sensitivity = grid.sensitivity;
+  for (Index i = first_state; i <= last_state; ++i) {
+    const Index row = std::lower_bound(sensitivity.times.begin(), sensitivity.times.end(), times[i]) - sensitivity.times.begin();
+    const auto [from, to] = range_of(times[i] - 2 * knots, times[i] + 2 * knots);
+    for (Index k = from; k < to; ++k) {
+      const auto at = static_cast<std::size_t>(k);
+      const double before = samples.time[k > 0 ? at - 1 : at], after = samples.time[k + 1 < samples.size() ? at + 1 : at];
+      const double share = weights[i] * std::min((after - before) / 2, knots) / knots, x = (times[i] - samples.time[at]) / knots;
+      out.weights.row(k - begin) +=
+          share * (spline(x) * sensitivity.by_position.row(row) + spline_slope(x) / knots * sensitivity.by_velocity.row(row));
+    }
+  }
+  return out;
+}
+
+// c less what the errors of the states make of the other side
+NoiseWeights noise_weights(const Samples& samples, const WindowGrid& grid, const Window& window, const VectorXd& c,
+                           const VectorXd& times, const VectorXd& weights) {
+  if (grid.sensitivity.by_position.size() == 0) return {window.first - 1, c};
+  const NoiseWeights errors = weights_of_errors(samples, grid, times, weights);
+  const Index first = std::min(errors.first, window.first - 1);
+  const Index end = std::max(errors.first + errors.weights.rows(), window.first - 1 + c.size());
+  NoiseWeights out{first, MatrixXd::Zero(end - first, errors.weights.cols())};
+  out.weights.middleRows(errors.first - first, errors.weights.rows()) = -errors.weights;
+  out.weights.col(0).segment(window.first - 1 - first, c.size()) += c;
+  return out;
+}
+
+// of sums with such weights  (sums × sums), its lower triangle
+MatrixXd covariance_of(const Samples& samples, const std::vector<NoiseWeights>& sums) {
+  const Index n = std::ssize(sums);
+  const Eigen::Map<const VectorXd> variance(samples.variance.data(), samples.size());
+  MatrixXd covariance = MatrixXd::Zero(n, n);
+  for (Index r = 0; r < n; ++r) {
+    const NoiseWeights& one = sums[static_cast<std::size_t>(r)];
+    for (Index s = r; s >= 0; --s) {
+      const NoiseWeights& other = sums[static_cast<std::size_t>(s)];
+      const Index first = std::max(one.first, other.first);
+      const Index common = std::min(one.first + one.weights.rows(), other.first + other.weights.rows()) - first;
+      if (common <= 0) break;
+      const auto here = one.weights.middleRows(first - one.first, common);
+      covariance(r, s) = here.cwiseProduct(other.weights.middleRows(first - other.first, common))
+                             .rowwise()
+                             .sum()
+                             .dot(variance.segment(first, common));
+    }
+  }
+  return covariance;
+}
+
 }  // namespace
 
 std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& positions, const SmootherModel& model,
                                                 const WindowGrid& grid, const std::vector<int>& windows, const VectorXd& times,
                                                 int row, int first_state) {
   const Samples samples(positions, model);
-  std::vector<Window> made;
-  std::vector<VectorXd> of_positions;
+  std::vector<NoiseWeights> noise;
   std::vector<WeightedSum> sums;
   for (const int number : windows) {
     const Window window = make_window(samples, grid, number);
@@ -141,23 +224,11 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
     const double origin = samples.value[static_cast<std::size_t>(window.first)];
     for (Index i = 0; i < c.size(); ++i)
       sum.value += c[i] * (samples.value[static_cast<std::size_t>(window.first - 1 + i)] - origin);
-    made.push_back(window);
-    of_positions.push_back(c);
+    noise.push_back(noise_weights(samples, grid, window, c, times, weights));
   }
-  const Index n = std::ssize(sums);
-  MatrixXd covariance = MatrixXd::Zero(n, n);
-  for (Index r = 0; r < n; ++r) {
-    for (Index s = r; s >= 0; --s) {
-      const VectorXd &c = of_positions[static_cast<std::size_t>(r)], &d = of_positions[static_cast<std::size_t>(s)];
-      const Index first = made[static_cast<std::size_t>(r)].first, shift = first - made[static_cast<std::size_t>(s)].first;
-      if (shift >= d.size()) break;
-      for (Index i = 0; i < std::min(c.size(), d.size() - shift); ++i) {
-        covariance(r, s) += c[i] * d[shift + i] * samples.variance[static_cast<std::size_t>(first - 1 + i)];
-      }
-    }
-  }
+  const MatrixXd covariance = covariance_of(samples, noise);
   const MatrixXd L = covariance.llt().matrixL();
-  for (Index r = 0; r < n; ++r) {
+  for (Index r = 0; r < std::ssize(sums); ++r) {
     Index from = 0;
     while (from < r && covariance(r, from) == 0) ++from;
     sums[static_cast<std::size_t>(r)].noise = L.row(r).segment(from, r - from + 1).transpose();

@@ -1,12 +1,12 @@
 #include <algorithm>
 #include <array>
-#include <charconv>
 #include <iterator>
 #include <numbers>
 #include <utility>
 
 #include <fmt/format.h>
 
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/symbolic/expression.hpp"
 #include "symbolic/functions.hpp"
@@ -35,13 +35,6 @@ struct Written {
   std::vector<Piece> pieces;
   Binding binding = atomic;
 };
-
-/// The shortest digits that read back as `value`, whatever the locale.
-std::string shortest(double value) {
-  std::array<char, 32> buffer;
-  const auto [end, error] = std::to_chars(buffer.data(), buffer.data() + buffer.size(), value);
-  return {buffer.data(), end};
-}
 
 /// A number in MathML: its sign is an operator, a power of ten is raised.
 Written write_mathml_number(double value) {

@@ -35,15 +35,19 @@ bool moves_the_system(const Prior& prior, const std::vector<const Observations*>
   });
 }
 
-// The residuals at all states, one row for each residual of the system; 0 where the log lacks what one reads.
+// The residuals at all states, one row for each residual of the system; NaN or ∞ where the log lacks what one reads.
 MatrixXd residuals_at(const System& system, const std::vector<const Observations*>& groups, const VectorXd& parameters) {
   MatrixXd all(std::ssize(system.residual_labels()), 0);
   for (const Observations* group : groups) {
     const MatrixXd more = system.residuals(group->states(), parameters);
     all.conservativeResize(Eigen::NoChange, all.cols() + more.cols());
-    all.rightCols(more.cols()) = more.unaryExpr([](double c) { return std::isfinite(c) ? c : 0.0; });
+    all.rightCols(more.cols()) = more;
   }
   return all;
+}
+
+MatrixXd zero_where_unknown(const MatrixXd& values) {
+  return values.unaryExpr([](double c) { return std::isfinite(c) ? c : 0.0; });
 }
 
 struct LeastSquares {
@@ -61,26 +65,28 @@ LeastSquares solve(const Prior& prior, const std::vector<const Observations*>& g
   constexpr int max_iterations = 30;
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     parameters(indices) = out.value;
-    const MatrixXd c = residuals_at(system, groups, parameters);
+    const MatrixXd residuals = residuals_at(system, groups, parameters), c = zero_where_unknown(residuals);
     MatrixXd J(c.size(), n);
     for (Index p = 0; p < n; ++p) {
       VectorXd above = parameters, below = parameters;
       const double step = 6e-6 * scale[p];
       above[indices[static_cast<std::size_t>(p)]] += step;
       below[indices[static_cast<std::size_t>(p)]] -= step;
-      J.col(p) = (residuals_at(system, groups, above) - residuals_at(system, groups, below)).reshaped() / (2 * step) * scale[p];
+      const MatrixXd change = residuals_at(system, groups, above) - residuals_at(system, groups, below);
+      J.col(p) = zero_where_unknown(change).reshaped() / (2 * step) * scale[p];
     }
     // a residual that is exact still has the rounding of its terms
     VectorXd weight(c.rows());
     for (Index k = 0; k < c.rows(); ++k) {
       const double terms = J.reshaped(c.rows(), c.cols() * n).row(k).cwiseAbs().maxCoeff();
-      const double scatter = c.row(k).norm() / std::sqrt(static_cast<double>(std::max<Index>(1, c.cols() - n)));
+      const Index n_known = residuals.row(k).array().isFinite().count();
+      const double scatter = c.row(k).norm() / std::sqrt(static_cast<double>(std::max<Index>(1, n_known - n)));
       weight[k] = terms > 0 ? 1 / std::max(scatter, 1e-9 * terms) : 0;
     }
     const VectorXd weights = weight.replicate(c.cols(), 1);
     const Eigen::JacobiSVD<MatrixXd> svd(weights.asDiagonal() * J, Eigen::ComputeThinU | Eigen::ComputeThinV);
     const VectorXd& singular = svd.singularValues();
-    const double smallest = 1e-8 * (n > 0 ? singular[0] : 0);
+    const double smallest = 1e-8 * singular[0];
     VectorXd step = VectorXd::Zero(n), variance = VectorXd::Zero(n);
     for (Index r = 0; r < singular.size(); ++r) {
       const VectorXd v = svd.matrixV().col(r);

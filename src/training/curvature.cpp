@@ -19,10 +19,12 @@ using Eigen::VectorXd;
 
 namespace {
 
-std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
+std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters, AtBound at_bound) {
   std::vector<int> free;
   for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-    if (!hyperparameters[k].at_bound() && !hyperparameters[k].is_fixed()) free.push_back(static_cast<int>(k));
+    const Hyperparameter& h = hyperparameters[k];
+    const bool is_held = h.at_bound() && !(at_bound == AtBound::free_if_open && h.is_system_parameter());
+    if (!is_held && !h.is_fixed()) free.push_back(static_cast<int>(k));
   }
   return free;
 }
@@ -30,8 +32,12 @@ std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
 class Differences {
  public:
   Differences(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-              const std::atomic<bool>* stop)
-      : objective_(objective), x_(x), hyperparameters_(hyperparameters), stop_(stop), free_(free_ones(hyperparameters)) {}
+              const std::atomic<bool>* stop, AtBound at_bound)
+      : objective_(objective),
+        x_(x),
+        hyperparameters_(hyperparameters),
+        stop_(stop),
+        free_(free_ones(hyperparameters, at_bound)) {}
 
   [[nodiscard]] const std::vector<int>& free() const { return free_; }
 
@@ -61,10 +67,11 @@ class Differences {
   }
   [[nodiscard]] bool is_parameter(Index k) const { return at(k).is_system_parameter(); }
 
-  // at most so long that `times` steps stay in the box
+  // at most so long that `times` steps stay in the box, or twice as many away from a bound
   [[nodiscard]] double within_box(Index k, double step, double times) const {
     const Hyperparameter& h = at(k);
     const double x = h.coordinate();
+    if (h.at_bound()) return std::min(step, (h.upper_coordinate() - h.lower_coordinate()) / (3 * times));
     return std::min({step, (x - h.lower_coordinate()) / times, (h.upper_coordinate() - x) / times});
   }
 
@@ -81,6 +88,14 @@ class Differences {
   }
 
   [[nodiscard]] VectorXd central(Index k, double step, Likelihood::Workspace& workspace) const {
+    if (at(k).at_bound()) {
+      // to one side, and of second order too
+      const Hyperparameter& h = at(k);
+      const bool is_lower = h.coordinate() - h.lower_coordinate() < h.upper_coordinate() - h.coordinate();
+      const double inwards = is_lower ? step : -step;
+      const VectorXd here = gradient_at(k, 0, workspace), one = gradient_at(k, inwards, workspace);
+      return (4 * one - gradient_at(k, 2 * inwards, workspace) - 3 * here) / (2 * inwards);
+    }
     return (gradient_at(k, step, workspace) - gradient_at(k, -step, workspace)) / (2 * step);
   }
 
@@ -117,17 +132,13 @@ MatrixXd Curvature::information() const {
   return axes * steep.asDiagonal() * axes.transpose();
 }
 
-Curvature curvature_at(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                       const Evaluators& evaluators, const std::atomic<bool>* stop) {
-  const Differences differences(objective, x, hyperparameters, stop);
+namespace {
+
+Curvature curvature_of(std::vector<int> free, VectorXd gradient, const MatrixXd& H) {
   Curvature out;
-  out.free = differences.free();
-  Likelihood::Workspace workspace(evaluators.alone, stop);
-  VectorXd gradient = VectorXd::Zero(x.size());
-  objective(x, &gradient, workspace);
-  out.gradient = gradient(out.free);
+  out.free = std::move(free);
+  out.gradient = std::move(gradient);
   if (out.free.empty()) return out;
-  const MatrixXd H = differences.hessian(evaluators);
   out.unit = H.diagonal().array().abs().max(1e-10).rsqrt();
   const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(MatrixXd(out.unit.asDiagonal() * H * out.unit.asDiagonal()));
   out.eigenvalues = eigen.eigenvalues();
@@ -136,6 +147,36 @@ Curvature curvature_at(const Objective& objective, const VectorXd& x, const std:
   constexpr double bend = 1e-2;  // of a valley over one deviation, for data that know a parameter to a hundredth
   out.zero = std::max(of_differences, bend * out.unit.cwiseProduct(out.gradient).norm());
   return out;
+}
+
+}  // namespace
+
+Curvature curvature_at(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
+                       const Evaluators& evaluators, const std::atomic<bool>* stop, AtBound at_bound) {
+  const Differences differences(objective, x, hyperparameters, stop, at_bound);
+  Likelihood::Workspace workspace(evaluators.alone, stop);
+  VectorXd gradient = VectorXd::Zero(x.size());
+  objective(x, &gradient, workspace);
+  const std::vector<int>& all = differences.free();
+  const MatrixXd H = all.empty() ? MatrixXd() : differences.hessian(evaluators);
+  // those at a bound are held where the objective falls towards it, and then where no open direction has a part in them
+  const auto without = [&](const Curvature& from, const auto& is_held) {
+    std::vector<int> in_all, kept;
+    for (std::size_t k = 0; k < all.size(); ++k) {
+      const auto place = std::ranges::find(from.free, all[k]);
+      if (place == from.free.end()) continue;
+      if (hyperparameters[static_cast<std::size_t>(all[k])].at_bound() && is_held(place - from.free.begin())) continue;
+      in_all.push_back(static_cast<int>(k));
+      kept.push_back(all[k]);
+    }
+    return kept == from.free ? from : curvature_of(kept, gradient(kept), H(in_all, in_all));
+  };
+  const Curvature with_all = curvature_of(all, gradient(all), H);
+  constexpr double pushed = 0.1;  // deviations
+  const Curvature resting =
+      without(with_all, [&](Index k) { return !(std::abs(with_all.gradient[k]) * with_all.unit[k] < pushed); });
+  const Index n_flat = (resting.eigenvalues.array() <= resting.zero).count();
+  return without(resting, [&](Index k) { return !(resting.eigenvectors.row(k).head(n_flat).squaredNorm() > 1e-4); });
 }
 
 VectorXd scales_of_parameters(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,

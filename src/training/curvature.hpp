@@ -32,11 +32,15 @@ struct Curvature {
   [[nodiscard]] Eigen::MatrixXd information() const;
 };
 
-/// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ.
+/// Parameters at a bound are held, or free where the objective is flat along a direction that they have a part in: then they are
+/// at the bound by chance, and those beside them are as little known.
+enum class AtBound { held, free_if_open };
+
+/// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ, nine at a bound.
 /// @param stop  where it is given, and set: no further evaluation is begun
 /// @throws NumericalError when the objective is not finite about x, or on a stop
 Curvature curvature_at(const Objective& objective, const Eigen::VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                       const Evaluators& evaluators, const std::atomic<bool>* stop = nullptr);
+                       const Evaluators& evaluators, const std::atomic<bool>* stop = nullptr, AtBound at_bound = AtBound::held);
 
 LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters);
 

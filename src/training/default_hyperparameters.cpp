@@ -51,85 +51,59 @@ void set_range(Hyperparameter& h, const Latent::Range& range, const Protocol& pr
   }
 }
 
+constexpr Latent::Range standard_lengthscale = {Standard::lengthscale_initial, Standard::lengthscale_lower,
+                                                Standard::lengthscale_upper, Standard::lengthscale_median,
+                                                Standard::lengthscale_log_stddev};
+constexpr Latent::Range paper_lengthscale = {1, 0.5, 20, Standard::lengthscale_median, Standard::lengthscale_log_stddev};
+constexpr Latent::Range standard_signal = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper,
+                                           Standard::signal_median, Standard::signal_log_stddev};
+constexpr Latent::Range positive_signal = {1, 0.05, 5, 1, 0.7};  // of a logarithm: a deviation of 1 is a factor of e
+constexpr Latent::Range paper_signal = {1, 0.5, 10, 0, 0};
+constexpr Latent::Range size_of_discrepancy = {Standard::discrepancy_median, Standard::discrepancy_lower,
+                                               Standard::discrepancy_upper, Standard::discrepancy_median,
+                                               Standard::discrepancy_log_stddev};
+
 Latent::Range lengthscale_range(const Latent& latent, const Protocol& protocol) {
-  const Latent::Range paper = {1, 0.5, 20, Standard::lengthscale_median, Standard::lengthscale_log_stddev};
-  const Latent::Range standard = {Standard::lengthscale_initial, Standard::lengthscale_lower, Standard::lengthscale_upper,
-                                  Standard::lengthscale_median, Standard::lengthscale_log_stddev};
-  return filled(latent.lengthscale, protocol.name == Protocol::Name::paper ? paper : standard, protocol);
+  const bool is_paper = protocol.name == Protocol::Name::paper;
+  return filled(latent.lengthscale, is_paper ? paper_lengthscale : standard_lengthscale, protocol);
 }
 
 Hyperparameter kernel_hyperparameter(const Latent& latent, std::size_t owner, std::size_t index, const Scales& scales,
                                      const Protocol& protocol) {
   const Kernel::Parameter& parameter = latent.kernel.parameters()[index];
+  const auto feature = static_cast<std::size_t>(parameter.feature);
   Hyperparameter h = Hyperparameter::of(Kind::kernel, owner, index);
   h.unit = std::string("1");
   Latent::Range range = {1, 1e-3, 1e3, 1, Standard::shape_log_stddev};
   switch (parameter.kind) {
     case Kernel::ParameterKind::lengthscale:
+      h.unit = unit_of(latent.feature_names[feature]);
       range = scaled(lengthscale_range(latent, protocol), scales.feature_stddev[owner][parameter.feature]);
-      if (!latent.feature_lengthscales.empty()) {
-        range = filled(latent.feature_lengthscales[static_cast<std::size_t>(parameter.feature)], range, protocol);
-      }
+      if (!latent.feature_lengthscales.empty()) range = filled(latent.feature_lengthscales[feature], range, protocol);
       break;
     case Kernel::ParameterKind::periodic_lengthscale:
       range = lengthscale_range(latent, protocol);
       break;
     case Kernel::ParameterKind::period:
+      h.unit = unit_of(latent.feature_names[feature]);
       range = scaled({0.5, 0.02, 20, 0.5, Standard::shape_log_stddev}, scales.feature_range[owner][parameter.feature]);
       break;
     case Kernel::ParameterKind::shape:
     case Kernel::ParameterKind::amplitude:
       break;
   }
-  const bool has_unit = parameter.kind == Kernel::ParameterKind::lengthscale || parameter.kind == Kernel::ParameterKind::period;
-  if (has_unit) h.unit = unit_of(latent.feature_names[static_cast<std::size_t>(parameter.feature)]);
   set_range(h, range, protocol);
   return h;
 }
 
-// one factor of the default scales, for all columns
-Hyperparameter shared_signal(const Latent& latent, std::size_t owner, const Scales& scales, const Protocol& protocol) {
+// one factor for all columns of a latent
+Hyperparameter shared_signal(std::size_t owner, std::string name, std::string unit, VectorXd column_scale,
+                             const Latent::Range& range, const Protocol& protocol) {
   Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
-  h.unit = "default scale of each column";
-  h.column_scale = scales.signal_stddev[owner];
-  set_range(h, filled(latent.signal_stddev, {1, 0.5, 10, 0, 0}, protocol), protocol);
-  return h;
-}
-
-// in units of what its directions are: of the noise as measured
-Hyperparameter size_of_discrepancy(const Latent& latent, std::size_t owner, const Protocol& protocol) {
-  Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
-  h.name = latent.name + ".size";
-  h.unit = "noise";
-  h.column_scale = VectorXd::Ones(latent.size());
-  set_range(h,
-            {Standard::discrepancy_median, Standard::discrepancy_lower, Standard::discrepancy_upper, Standard::discrepancy_median,
-             Standard::discrepancy_log_stddev},
-            protocol);
-  return h;
-}
-
-Hyperparameter column_signal(const Latent& latent, std::size_t owner, std::size_t column, const Scales& scales,
-                             const Protocol& protocol) {
-  Hyperparameter h = Hyperparameter::of(Kind::signal_stddev, owner, column);
-  h.unit = unit_of(latent.column_names[column]);
-  const Latent::Range linear = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper, Standard::signal_median,
-                                Standard::signal_log_stddev};
-  const Latent::Range logarithmic = {1, 0.05, 5, 1, 0.7};  // of which a deviation of 1 is a factor of e
-  const Latent::Range& standard = latent.is_positive ? logarithmic : linear;
-  set_range(h, scaled(filled(latent.signal_stddev, standard, protocol), scales.signal_stddev[owner][static_cast<Index>(column)]),
-            protocol);
-  return h;
-}
-
-// of the potential itself, which has one for all the columns of its gradient
-Hyperparameter signal_of_potential(const Latent& latent, std::size_t owner, const Scales& scales, const Protocol& protocol) {
-  Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
-  h.unit = "unit of energy";
-  h.column_scale = VectorXd::Ones(latent.size());
-  const Latent::Range standard = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper,
-                                  Standard::signal_median, Standard::signal_log_stddev};
-  set_range(h, scaled(filled(latent.signal_stddev, standard, protocol), scales.signal_stddev[owner][0]), protocol);
+  h.name = std::move(name);
+  h.unit = std::move(unit);
+  h.column_scale = std::move(column_scale);
+  set_range(h, range, protocol);
   return h;
 }
 
@@ -139,19 +113,24 @@ void add_latent(const Latent& latent, std::size_t owner, const std::string& pref
     out.push_back(kernel_hyperparameter(latent, owner, p, scales, protocol));
     out.back().name = prefix + latent.kernel.parameters()[p].name;
   }
+  const VectorXd& scale = scales.signal_stddev[owner];
   if (protocol.name == Protocol::Name::paper) {
-    out.push_back(shared_signal(latent, owner, scales, protocol));
-    out.back().name = prefix + "signal_stddev";
+    out.push_back(shared_signal(owner, prefix + "signal_stddev", "default scale of each column", scale,
+                                filled(latent.signal_stddev, paper_signal, protocol), protocol));
     return;
   }
+  const Latent::Range range = filled(latent.signal_stddev, latent.is_positive ? positive_signal : standard_signal, protocol);
   if (latent.is_potential) {
-    out.push_back(signal_of_potential(latent, owner, scales, protocol));
-    out.back().name = prefix + "signal_stddev(potential)";
+    // that of the potential itself, for all the columns of its gradient
+    out.push_back(shared_signal(owner, prefix + "signal_stddev(potential)", "unit of energy", VectorXd::Ones(latent.size()),
+                                scaled(range, scale[0]), protocol));
     return;
   }
   for (std::size_t l = 0; l < latent.column_names.size(); ++l) {
-    out.push_back(column_signal(latent, owner, l, scales, protocol));
-    out.back().name = fmt::format("{}signal_stddev({})", prefix, latent.column_names[l]);
+    Hyperparameter& h = out.emplace_back(Hyperparameter::of(Kind::signal_stddev, owner, l));
+    h.name = fmt::format("{}signal_stddev({})", prefix, latent.column_names[l]);
+    h.unit = unit_of(latent.column_names[l]);
+    set_range(h, scaled(range, scale[static_cast<Index>(l)]), protocol);
   }
 }
 
@@ -176,7 +155,9 @@ void add_latents(const Prior& prior, const Scales& scales, const Protocol& proto
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
     if (latent.has_one_signal) {
-      out.push_back(size_of_discrepancy(latent, a, protocol));
+      // in units of what its directions are: of the noise as measured
+      out.push_back(
+          shared_signal(a, latent.name + ".size", "noise", VectorXd::Ones(latent.size()), size_of_discrepancy, protocol));
       continue;
     }
     const std::string name = tuned.size() == 1 ? "" : latent.name + ".";

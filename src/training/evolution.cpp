@@ -1,5 +1,6 @@
 #include "training/evolution.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <utility>
 

@@ -10,6 +10,7 @@
 #include "gp2/error.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/requirements.hpp"
+#include "training/hamiltonian.hpp"
 #include "training/optimum.hpp"
 
 namespace gp2 {

@@ -249,7 +249,6 @@ Steps run_chain(Chain& chain, int max_evaluations, const std::atomic<bool>* stop
 
 HamiltonianDraws draw_coordinates(const Objective& objective, const std::vector<HamiltonianStart>& starts, const VectorXd& lower,
                                   const VectorXd& upper, const HamiltonianOptions& options) {
-  std::vector<Steps> kept(starts.size());
   std::mutex mutex;
   double n_done = 0;
   const auto progress = [&](int evaluations) {
@@ -268,7 +267,8 @@ HamiltonianDraws draw_coordinates(const Objective& objective, const std::vector<
                           options.stop);
               run_chain(chain, of_chain, options.stop, progress).print(column);
             });
-  for (std::size_t c = 0; c < starts.size(); ++c) kept[c] = Steps(numbers.col(static_cast<Index>(c)), n_x);
+  std::vector<Steps> kept;
+  for (const auto& column : numbers.colwise()) kept.emplace_back(column, n_x);
   if (is_set(options.stop)) throw NumericalError("stopped before all hyperparameters were drawn");
 
   // as many of each chain, the last ones
@@ -291,16 +291,6 @@ HamiltonianDraws draw_coordinates(const Objective& objective, const std::vector<
 
 namespace {
 
-struct Box {
-  VectorXd lower, upper;
-  explicit Box(const std::vector<Hyperparameter>& hyperparameters) : lower(std::ssize(hyperparameters)), upper(lower.size()) {
-    for (Index k = 0; k < lower.size(); ++k) {
-      lower[k] = hyperparameters[static_cast<std::size_t>(k)].lower_coordinate();
-      upper[k] = hyperparameters[static_cast<std::size_t>(k)].upper_coordinate();
-    }
-  }
-};
-
 // An optimum, and Laplace's approximation there.
 struct Mode {
   HamiltonianStart at;
@@ -309,8 +299,8 @@ struct Mode {
 };
 
 // How far the density reaches inwards from a bound at which coordinate k of x stands, by its slope and curvature there.
-double reach_from_bound(const Objective& objective, const VectorXd& x, Index k, const VectorXd& gradient, const Box& box,
-                        Likelihood::Workspace& workspace) {
+double reach_from_bound(const Objective& objective, const VectorXd& x, Index k, const VectorXd& gradient,
+                        const CoordinateBox& box, Likelihood::Workspace& workspace) {
   const double step = std::min(3e-3, (box.upper[k] - box.lower[k]) / 2);
   VectorXd inside = x, gradient_inside = gradient;
   inside[k] += x[k] - box.lower[k] < box.upper[k] - x[k] ? step : -step;
@@ -321,7 +311,7 @@ double reach_from_bound(const Objective& objective, const VectorXd& x, Index k, 
 
 // The metric is that of the curvature, no longer than half the box, or `longest` where the data say nothing.
 Mode mode_at(const Objective& objective, const std::vector<Hyperparameter>& optimum, const std::vector<bool>& held,
-             const Box& box, const HamiltonianOptions& options) {
+             const CoordinateBox& box, const HamiltonianOptions& options) {
   constexpr double longest = 2;
   Mode mode{{coordinates(optimum), MatrixXd::Zero(box.lower.size(), box.lower.size())}};
   Likelihood::Workspace workspace(options.evaluators.alone, options.stop);
@@ -364,7 +354,7 @@ Mode mode_at(const Objective& objective, const std::vector<Hyperparameter>& opti
 
 // The optima that are not too unlikely and not one another.
 std::vector<Mode> modes_of(const Objective& objective, const std::vector<std::vector<Hyperparameter>>& optima,
-                           const std::vector<bool>& held, const Box& box, const HamiltonianOptions& options) {
+                           const std::vector<bool>& held, const CoordinateBox& box, const HamiltonianOptions& options) {
   constexpr double too_unlikely = 12;  // nats: a mode as wide as the best one would have a mass of 6e-6
   constexpr std::size_t most = 4;
   std::vector<Mode> modes{mode_at(objective, optima.front(), held, box, options)};
@@ -391,7 +381,7 @@ std::vector<Mode> modes_of(const Objective& objective, const std::vector<std::ve
   return modes;
 }
 
-std::vector<HamiltonianStart> starts_at(const Objective& objective, const std::vector<Mode>& modes, const Box& box,
+std::vector<HamiltonianStart> starts_at(const Objective& objective, const std::vector<Mode>& modes, const CoordinateBox& box,
                                         const HamiltonianOptions& options) {
   constexpr int n_chains = 8;
   double largest = modes.front().log_mass, sum = 0;
@@ -461,7 +451,7 @@ void summarise(const MatrixXd& values, HyperparameterDraws& out) {
 HyperparameterDraws draw_about(const Objective& objective, const std::vector<std::vector<Hyperparameter>>& optima,
                                const std::vector<bool>& held, int n_draws, const HamiltonianOptions& options) {
   const std::vector<Hyperparameter>& best = optima.front();
-  const Box box(best);
+  const CoordinateBox box(best);
   const std::vector<Mode> modes = modes_of(objective, optima, held, box, options);
   const std::vector<HamiltonianStart> starts = starts_at(objective, modes, box, options);
   const HamiltonianDraws drawn = draw_coordinates(objective, starts, box.lower, box.upper, options);

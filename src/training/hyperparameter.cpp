@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <set>
+#include <tuple>
 
 #include <fmt/format.h>
 
@@ -176,9 +178,14 @@ void require_hyperprior(const Hyperparameter& h) {
 void require_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
                              const std::vector<Hyperparameter>& hyperparameters) {
   require_places(prior, observations, hyperparameters);
+  std::set<std::tuple<Kind, int, int>> taken;
   for (const Hyperparameter& h : hyperparameters) {
     require_bounds(h);
     require_hyperprior(h);
+    // the last of two would count, but both have its slope
+    const int owner = h.is_system_parameter() ? 0 : h.owner;
+    if (taken.emplace(h.kind, owner, h.index).second) continue;
+    throw InputError(fmt::format("hyperparameter '{}' stands twice; leave out one", h.name));
   }
 }
 

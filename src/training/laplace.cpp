@@ -1,5 +1,4 @@
 #include "gp2/training/laplace.hpp"
-#include "base/not_a_number.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -10,6 +9,7 @@
 
 #include "base/decompositions.hpp"
 #include "base/lapack.hpp"
+#include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "inference/requirements.hpp"
 #include "training/constraint_parameters.hpp"
@@ -20,10 +20,8 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
-namespace {
 
-// of x in LaplaceUncertainty: its coordinate's unit, and 1 of logarithms
-double unit_of(const Hyperparameter& h) { return h.map().is_logarithm ? 1 : h.map().unit; }
+namespace {
 
 constexpr double wider = 1e6;
 
@@ -92,7 +90,7 @@ LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::ve
   };
   for (Index k = 0; k < n_free; ++k) {
     const Index at = free[static_cast<std::size_t>(k)];
-    const double to_unit = curvature.unit[k] * unit_of(hyperparameters[static_cast<std::size_t>(at)]);
+    const double to_unit = curvature.unit[k] * hyperparameters[static_cast<std::size_t>(at)].map().unit;
     out.stddev[at] = is_flat(k) ? infinity : to_unit * within[k];
     out.undetermined.row(at) = to_unit * flat.row(k);
     for (Index l = 0; l < k; ++l) {
@@ -113,7 +111,8 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
   require_hyperparameters(prior, observations, hyperparameters);
   const lapack::SingleThread single_thread;
   const Objective objective(prior, observations, hyperparameters, about_posterior_mean(prior, observations, hyperparameters));
-  return laplace_uncertainty(curvature_at(objective, coordinates(hyperparameters), hyperparameters, thread_count(n_threads)),
+  return laplace_uncertainty(curvature_at(objective, coordinates(hyperparameters), hyperparameters, thread_count(n_threads),
+                                          nullptr, AtBound::free_if_open),
                              hyperparameters);
 }
 
@@ -169,14 +168,51 @@ std::string changes_along(const std::vector<Hyperparameter>& hyperparameters, co
   return fmt::format("{}", fmt::join(changes, ", "));
 }
 
-void note_distance(double distance, std::vector<UncertaintyNote>& notes) {
+void note_distance(const LaplaceUncertainty& uncertainty, const std::vector<int>& parameters,
+                   std::vector<UncertaintyNote>& notes) {
   constexpr double far = 0.5;  // standard deviations
+  const double distance = uncertainty.distance_from_optimum;
   if (!(distance > far)) return;
+  const bool has_open = std::ranges::any_of(parameters, [&](int k) { return std::isinf(uncertainty.stddev[k]); });
   notes.push_back({true,
                    fmt::format("the standard errors are rough: the optimiser stopped {}",
                                std::isfinite(distance) ? fmt::format("{:.2g} standard deviations before the optimum", distance)
                                                        : "where no optimum is near"),
-                   "Fit with a larger `max_iterations`, or `start` from this fit"});
+                   has_open ? "Know first what the data do not determine: along it no optimum is reached"
+                            : "Fit with a larger `max_iterations`, or `start` from this fit"});
+}
+
+// Of parameters at a bound nothing is known but that, and standard errors of others would be larger were they free.
+void note_held(const std::vector<Hyperparameter>& fitted, const LaplaceUncertainty& uncertainty,
+               const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
+  std::vector<std::string> held;
+  bool has_errors = false;
+  for (const int k : parameters) {
+    const bool at_bound = fitted[static_cast<std::size_t>(k)].at_bound();
+    if (at_bound && !std::isinf(uncertainty.stddev[k])) held.push_back(fitted[static_cast<std::size_t>(k)].name);
+    has_errors = has_errors || (!at_bound && uncertainty.stddev[k] > 0 && std::isfinite(uncertainty.stddev[k]));
+  }
+  if (held.empty() || !has_errors) return;
+  notes.push_back({false, fmt::format("the standard errors hold {} at the bound", fmt::join(held, ", ")),
+                   "Were they free, the others could be known far less: fit with wider bounds"});
+}
+
+// Priors of parameters that the data contradict, or that their bounds do.
+void note_priors(const std::vector<Hyperparameter>& fitted, const std::vector<int>& parameters,
+                 std::vector<UncertaintyNote>& notes) {
+  constexpr double far = 3;  // deviations
+  for (const int k : parameters) {
+    const Hyperparameter& h = fitted[static_cast<std::size_t>(k)];
+    if (h.hyperprior.form == HyperPrior::Form::none || h.is_fixed()) continue;
+    const double deviations = std::abs(h.hyperprior.standardised(h.value));
+    if (!(deviations > far)) continue;
+    const bool is_outside = h.hyperprior.median < h.lower || h.hyperprior.median > h.upper;
+    notes.push_back({true,
+                     fmt::format("{} = {:.6g} lies {:.2g} deviations of its prior from the middle of that, {:.6g}{}", h.name,
+                                 h.value, deviations, h.hyperprior.median, is_outside ? ", which its bounds forbid" : ""),
+                     is_outside ? "Mend the prior or the bounds"
+                                : "The prior or the model is wrong, and standard errors take both for right"});
+  }
 }
 
 // The likelihood may have other optima, which a single start does not find, with other parameters and standard errors.
@@ -265,10 +301,12 @@ std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
     if (fitted[static_cast<std::size_t>(k)].is_system_parameter()) parameters.push_back(k);
   }
   std::vector<UncertaintyNote> notes;
-  note_distance(report.uncertainty->distance_from_optimum, notes);
+  note_distance(*report.uncertainty, parameters, notes);
   note_open_parameters(fitted, *report.uncertainty, parameters, notes);
   note_silent_parameters(fitted, *report.uncertainty, parameters, notes);
   note_pairs(fitted, *report.uncertainty, parameters, notes);
+  note_held(fitted, *report.uncertainty, parameters, notes);
+  note_priors(fitted, parameters, notes);
   note_single_start(report, parameters, notes);
   return notes;
 }

@@ -1,4 +1,3 @@
-#include <algorithm>
 #include <cmath>
 #include <exception>
 #include <limits>
@@ -62,7 +61,7 @@ class LinearisationAtMean {
     for (int halvings = 0; halvings < most_halvings && !is_set(options_.stop); ++halvings) {
       for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
         Hyperparameter& h = hyperparameters[k];
-        h.value = std::clamp(h.value_at(0.5 * (h.coordinate() + last_[k].coordinate())), h.lower, h.upper);
+        h.value = h.value_at(0.5 * (h.coordinate() + last_[k].coordinate()));
       }
       if (move_to(hyperparameters)) return Found::elsewhere;
     }

@@ -116,4 +116,12 @@ VectorXd coordinates(const std::vector<Hyperparameter>& hyperparameters) {
   return x;
 }
 
+CoordinateBox::CoordinateBox(const std::vector<Hyperparameter>& hyperparameters)
+    : lower(static_cast<Index>(hyperparameters.size())), upper(lower.size()) {
+  for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
+    lower[static_cast<Index>(k)] = hyperparameters[k].lower_coordinate();
+    upper[static_cast<Index>(k)] = hyperparameters[k].upper_coordinate();
+  }
+}
+
 }  // namespace gp2

@@ -18,7 +18,7 @@ namespace gp2 {
 /// −log of the hyper-priors at the hyperparameters' own values, and its derivative in their coordinates added to `gradient`.
 double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparameters, Eigen::VectorXd* gradient);
 
-/// What the likelihood of all observations is told by.
+/// What stands in for the exact likelihood.
 struct Approximation {
   std::shared_ptr<const InducingPoints> points = nullptr;  // null: exact
   std::shared_ptr<const Linearisation> about = nullptr;    // of a nonlinear prior; null: where no latent acts
@@ -54,8 +54,8 @@ class Objective {
   Likelihood likelihood_;
 };
 
-/// Who evaluates an objective: exactly several evaluations go on at a time, each on a process of its own; through inducing points all
-/// processes work on one. Results do not depend on it.
+/// The threads and processes that evaluate an objective. Several exact evaluations go on at a time, each on one process;
+/// through inducing points all processes work on one evaluation. Results do not depend on it.
 struct Evaluators {
   Workers side_by_side;  // on so many evaluations at a time
   Workers alone;         // on one that no other goes on beside
@@ -96,5 +96,11 @@ void share_out(std::span<double> numbers, int n_tasks, const Workers& workers, c
 
 /// x: where hyperparameters stand, in their coordinates.
 Eigen::VectorXd coordinates(const std::vector<Hyperparameter>& hyperparameters);
+
+/// The bounds of x.
+struct CoordinateBox {
+  Eigen::VectorXd lower, upper;
+  explicit CoordinateBox(const std::vector<Hyperparameter>& hyperparameters);
+};
 
 }  // namespace gp2

@@ -88,15 +88,12 @@ class Training {
         options_(options),
         evaluators_(options, approximation.points != nullptr),
         objective_(prior, observations, hyperparameters, std::move(approximation), evaluators_.alone),
+        box_(hyperparameters),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
     for (int restart = 0; restart < n_restarts(); ++restart)
       n_own_ += evaluators_.side_by_side.owns(restart, n_restarts()) ? 1 : 0;
-    for (const Hyperparameter& h : hyperparameters) {
-      box_.lower.push_back(h.lower_coordinate());
-      box_.upper.push_back(h.upper_coordinate());
-    }
   }
 
   [[nodiscard]] int n_restarts() const {
@@ -164,15 +161,13 @@ class Training {
       return report_iteration(restart, iteration, value);
     };
     options.stop = [&] { return stopped(); };
-    const Index n = static_cast<Index>(from.size());
     LbfgsbResult result = minimise(
         [&](const VectorXd& scaled, VectorXd& gradient) {
           const double value = objective_(scaled.cwiseProduct(scales), &gradient, workspace);
           gradient = gradient.cwiseProduct(scales);
           return value;
         },
-        coordinates(from).cwiseQuotient(scales), Eigen::Map<const VectorXd>(box_.lower.data(), n).cwiseQuotient(scales),
-        Eigen::Map<const VectorXd>(box_.upper.data(), n).cwiseQuotient(scales), options);
+        coordinates(from).cwiseQuotient(scales), box_.lower.cwiseQuotient(scales), box_.upper.cwiseQuotient(scales), options);
     result.x = result.x.cwiseProduct(scales);
     return result;
   }
@@ -183,7 +178,6 @@ class Training {
     const Index n_x = std::ssize(hyperparameters_);
     std::vector<LbfgsbResult> results(static_cast<std::size_t>(n));
     Eigen::MatrixXd numbers(n_x + 5, n);  // x, and the rest
-    const auto numbers_of = [&](int k) { return std::span(numbers.col(k).data(), static_cast<std::size_t>(n_x + 5)); };
     share_out({numbers.data(), static_cast<std::size_t>(numbers.size())}, n, evaluators_.side_by_side,
               [&](int k, std::span<double> column) {
                 const LbfgsbResult& one = results[static_cast<std::size_t>(k)] = run(k);
@@ -193,8 +187,8 @@ class Training {
               });
     for (int k = 0; k < n; ++k) {
       LbfgsbResult& one = results[static_cast<std::size_t>(k)];
-      const std::span<const double> column = numbers_of(k), rest = column.last(5);
-      one.x = Eigen::Map<const VectorXd>(column.data(), n_x);
+      one.x = numbers.col(k).head(n_x);
+      const auto rest = numbers.col(k).tail(5);
       one.value = rest[0], one.converged = rest[1] == 1;
       one.iterations = static_cast<int>(rest[2]), one.evaluations = static_cast<int>(rest[3]);
       one.failed_evaluations = static_cast<int>(rest[4]);
@@ -256,7 +250,11 @@ class Training {
         const Curvature curvature = curvature_at(objective_, coordinates(at), at, evaluators_, options_.stop);
         const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
         if (curvature.distance_from_optimum() <= near || !may_go_on) {
-          uncertainty_ = laplace_uncertainty(curvature, at);
+          const bool has_bounded = std::ranges::any_of(at, [](const auto& h) { return h.is_system_parameter() && h.at_bound(); });
+          uncertainty_ = laplace_uncertainty(
+              has_bounded ? curvature_at(objective_, coordinates(at), at, evaluators_, options_.stop, AtBound::free_if_open)
+                          : curvature,
+              at);
           restore_undetermined(from, workspace);
           return;
         }
@@ -323,9 +321,9 @@ class Training {
     constexpr int n_points = 9;
     const VectorXd x = coordinates(results_[from]);
     // a box that is no more than a limit is too wide to scan, one without width has one point
-    std::vector<std::size_t> scanned;
+    std::vector<Index> scanned;
     for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
-      if (hyperparameters_[k].size == 0 && !hyperparameters_[k].is_fixed()) scanned.push_back(k);
+      if (hyperparameters_[k].size == 0 && !hyperparameters_[k].is_fixed()) scanned.push_back(static_cast<Index>(k));
     }
     if (scanned.empty()) return false;
     // many hyperparameters would cost more than all restarts
@@ -335,8 +333,8 @@ class Training {
     if (n_points * std::ssize(scanned) > spent) return false;
     const auto moved = [&](int trial) {
       VectorXd there = x;
-      const std::size_t k = scanned[static_cast<std::size_t>(trial / n_points)];
-      there[static_cast<Index>(k)] = box_.lower[k] + (box_.upper[k] - box_.lower[k]) * (trial % n_points + 1) / (n_points + 1);
+      const Index k = scanned[static_cast<std::size_t>(trial / n_points)];
+      there[k] = box_.lower[k] + (box_.upper[k] - box_.lower[k]) * (trial % n_points + 1) / (n_points + 1);
       return there;
     };
     std::vector<double> values(scanned.size() * n_points);
@@ -420,12 +418,10 @@ class Training {
   const FitOptions& options_;
   Evaluators evaluators_;
   Objective objective_;
+  CoordinateBox box_;
   int n_own_ = 0;  // restarts of this process
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
-  struct {
-    std::vector<double> lower, upper;
-  } box_;  // as the optimiser sees it
   int n_escapes_ = 0;
   std::optional<LaplaceUncertainty> uncertainty_;
   std::optional<HyperparameterDraws> draws_;

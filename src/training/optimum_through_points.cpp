@@ -68,10 +68,11 @@ class TrainingThroughPoints {
         try_from(first, best.has_value());
         if (const auto start = turned_on(best->hyperparameters, first)) try_from(*start, true);
       }
+      if (is_last && !is_exact) best = discrepancy_too(of_stage, *std::move(best), options);
       report = std::move(best);
       hyperparameters = report->hyperparameters;
     }
-    if (!report->inducing || n_train < n_all) report->inducing = points_of(chosen(observations_, hyperparameters));
+    if (!report->inducing || n_train < n_all) report->inducing = points_of_all(*report);
     report->inducing->left_out =
         is_set(options_.stop) ? left_out_as_some_tell(*report) : left_out(observations_, *report, all_workers());
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
@@ -146,12 +147,12 @@ class TrainingThroughPoints {
   }
 
   [[nodiscard]] InducingChoice chosen(const std::vector<Observations>& observations,
-                                      const std::vector<Hyperparameter>& hyperparameters) const {
+                                      const std::vector<Hyperparameter>& hyperparameters, int of_discrepancy = 0) const {
     ModelValues values = model_values(prior_, observations, hyperparameters);
-    const InducingOptions options{.most = options_.n_inducing};
+    const InducingOptions options{.most = options_.n_inducing, .of_discrepancy = of_discrepancy};
     const InducingChoice choice = choose_inducing_points(prior_, observations, values, options, all_workers());
     // how strongly a latent acts that is not linear is known through points alone, and decides where they should be
-    values.about = linearised(observations, hyperparameters, choice.points, all_workers());
+    values.about = values_through(choice.points, observations, hyperparameters, all_workers()).about;
     return values.about ? choose_inducing_points(prior_, observations, values, options, all_workers()) : choice;
   }
 
@@ -168,31 +169,75 @@ class TrainingThroughPoints {
     return is_any ? std::optional(std::move(found)) : std::nullopt;
   }
 
-  [[nodiscard]] FitReport through_points(const std::vector<Observations>& observations, std::vector<Hyperparameter> from,
-                                         FitOptions options) const {
+  // An optimum; where it is stopped before there is one, `best`, which is what was found so far.
+  [[nodiscard]] FitReport trained_through_choice(const InducingChoice& choice, const std::vector<Observations>& observations,
+                                                 const std::vector<Hyperparameter>& from, FitOptions options,
+                                                 const std::optional<FitReport>& best) const {
     // a gain of a thousandth of a nat is none
     options.reduction_tolerance = std::max(options.reduction_tolerance, 1e-3 / n_states(observations));
     options.n_restarts = 1;
     options.max_escapes = 0;
+    if (options_.improved) {
+      options.improved = [&](FitReport so_far, const std::vector<Observations>& of_stage) {
+        if (best && !(so_far.objective < best->objective)) return;
+        so_far.inducing = points_of(choice);
+        so_far.inducing->left_out = left_out_as_some_tell(so_far);
+        options_.improved(so_far, of_stage);
+      };
+    }
+    return unless_stopped(best, [&] {
+      FitReport report =
+          prior_.is_nonlinear()
+              ? trained_nonlinear(prior_, observations, from, options,
+                                  {choice.points, values_through(choice.points, observations, from, all_workers()).about})
+              : trained(prior_, observations, from, options, {choice.points, nullptr});
+      report.inducing = points_of(choice);
+      return report;
+    });
+  }
+
+  // With points of its own for a discrepancy, from which hyperparameters are learned anew, where these tell more than that it is
+  // there. Else they would take time, and the deviations shrink more than the errors.
+  [[nodiscard]] FitReport discrepancy_too(const std::vector<Observations>& observations, FitReport found,
+                                          const FitOptions& options) const {
+    constexpr int most = 200;
+    constexpr double worth = 10;  // nats
+    if (std::ranges::none_of(prior_.latents, is_local) || is_set(options.stop)) return found;
+    try {
+      const InducingChoice choice = chosen(observations, found.hyperparameters, most);
+      const FitReport as_it_is = conditioned(choice, observations, found, options);
+      if (!(found.objective - as_it_is.objective > worth)) return found;
+      FitReport trained = trained_through_choice(choice, observations, found.hyperparameters, options, as_it_is);
+      return trained.objective < found.objective ? std::move(trained) : found;
+    } catch (const NumericalError&) {  // or stopped
+      return found;
+    }
+  }
+
+  [[nodiscard]] FitReport conditioned(const InducingChoice& choice, const std::vector<Observations>& observations,
+                                      const FitReport& found, FitOptions options) const {
+    options.max_iterations = 0;
+    options.standard_errors = false;
+    options.progress = nullptr;
+    return trained_through_choice(choice, observations, found.hyperparameters, options, found);
+  }
+
+  // Among all states, where hyperparameters come from some.
+  [[nodiscard]] InducingReport points_of_all(const FitReport& of_some) const {
+    const InducingChoice choice = chosen(observations_, of_some.hyperparameters);
+    if (std::ranges::none_of(prior_.latents, is_local)) return points_of(choice);
+    FitOptions options = options_;
+    options.max_iterations = 0;
+    const FitReport found = conditioned(choice, observations_, of_some, options);
+    return *discrepancy_too(observations_, found, options).inducing;
+  }
+
+  [[nodiscard]] FitReport through_points(const std::vector<Observations>& observations, std::vector<Hyperparameter> from,
+                                         const FitOptions& options) const {
     std::optional<FitReport> best;
     for (int round = 0; round < n_rounds && !(best && is_set(options.stop)); ++round) {
       const InducingChoice choice = chosen(observations, from);
-      if (options_.improved) {
-        options.improved = [&](FitReport so_far, const std::vector<Observations>& of_stage) {
-          if (best && !(so_far.objective < best->objective)) return;
-          so_far.inducing = points_of(choice);
-          so_far.inducing->left_out = left_out_as_some_tell(so_far);
-          options_.improved(so_far, of_stage);
-        };
-      }
-      FitReport next = unless_stopped(best, [&] {
-        FitReport report = prior_.is_nonlinear()
-                               ? trained_nonlinear(prior_, observations, from, options,
-                                                   {choice.points, linearised(observations, from, choice.points, all_workers())})
-                               : trained(prior_, observations, from, options, {choice.points, nullptr});
-        report.inducing = points_of(choice);
-        return report;
-      });
+      FitReport next = trained_through_choice(choice, observations, from, options, best);
       const double gain = best ? best->objective - next.objective : std::numeric_limits<double>::infinity();
       const bool are_fewer = best && choice.n_variables < best->inducing->n_variables;
       if (!(gain > (are_fewer ? -enough : 0))) break;
@@ -205,27 +250,24 @@ class TrainingThroughPoints {
 
   [[nodiscard]] VectorXd left_out(const std::vector<Observations>& observations, const FitReport& report,
                                   const Workers& workers) const {
-    ModelValues values = model_values(prior_, observations, report.hyperparameters);
-    values.inducing = report.inducing->points;
-    values.about = linearised(observations, report.hyperparameters, report.inducing->points, workers);
-    return left_out_by_points(prior_, observations, values, workers);
+    return left_out_by_points(prior_, observations,
+                              values_through(report.inducing->points, observations, report.hyperparameters, workers), workers);
   }
 
   [[nodiscard]] Workers all_workers() const { return {thread_count(options_.n_threads), options_.ranks}; }
 
-  // Where a nonlinear prior is linear under these points; null, where no latent acts, as long as the mean is not found.
-  [[nodiscard]] std::shared_ptr<const Linearisation> linearised(const std::vector<Observations>& observations,
-                                                                const std::vector<Hyperparameter>& hyperparameters,
-                                                                const std::shared_ptr<const InducingPoints>& points,
-                                                                const Workers& workers) const {
-    if (!prior_.is_nonlinear()) return nullptr;
+  // With these points, and about the mean of a nonlinear prior under them; where it is not found about where no latent acts.
+  [[nodiscard]] ModelValues values_through(const std::shared_ptr<const InducingPoints>& points,
+                                           const std::vector<Observations>& observations,
+                                           const std::vector<Hyperparameter>& hyperparameters, const Workers& workers) const {
     ModelValues values = model_values(prior_, observations, hyperparameters);
     values.inducing = points;
+    if (!prior_.is_nonlinear()) return values;
     try {
-      return linearisation_of(prior_, observations, values, workers);
-    } catch (const NumericalError&) {
-      return nullptr;
+      values.about = linearisation_of(prior_, observations, values, workers);
+    } catch (const NumericalError&) {  // about is null
     }
+    return values;
   }
 
   // Of all states, while nothing else is under way on other processes.

@@ -3,8 +3,8 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <optional>
-#include <set>
 #include <tuple>
 
 #include <fmt/format.h>
@@ -16,6 +16,7 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "inference/requirements.hpp"
+#include "training/hamiltonian.hpp"
 
 namespace gp2 {
 
@@ -45,12 +46,21 @@ struct Choice {
   std::vector<Observations> observations;  // the distrusted values with a noise of their own
   std::vector<DistrustedValue> distrusted;
 
-  [[nodiscard]] std::set<std::tuple<int, int, int>> values() const {
-    std::set<std::tuple<int, int, int>> set;
-    for (const DistrustedValue& value : distrusted) set.emplace(value.group, value.row, value.state);
-    return set;
+  [[nodiscard]] std::map<std::tuple<int, int, int>, double> factors() const {
+    std::map<std::tuple<int, int, int>, double> factors;
+    for (const DistrustedValue& value : distrusted) factors[{value.group, value.row, value.state}] = value.noise_factor;
+    return factors;
   }
 };
+
+// Whether the same values are distrusted, by nearly the same factors: these are of a noise that may be estimated, which falls once
+// outliers add less to it.
+bool are_near(const Choice& a, const Choice& b) {
+  constexpr double near = 1.1;
+  return std::ranges::equal(a.factors(), b.factors(), [](const auto& one, const auto& other) {
+    return one.first == other.first && std::max(one.second, other.second) <= near * std::min(one.second, other.second);
+  });
+}
 
 // What all other values say of each, as leave_one_out. A posterior that keeps some of many states (KeptStates) says of each value with
 // it, y ~ N(m, v + σ²), what it says without: with h = v/σ², y − m and v are (1 − h) times what they are then.
@@ -87,10 +97,10 @@ Choice choose(const std::vector<Observations>& observations, const std::vector<O
       if (distances.empty()) continue;
       const double usual = std::max(1.0, median(std::move(distances)) / median_of_normal);
       for (Index i = 0; i < noise.cols(); ++i) {
-        const double distance = std::abs(residual(k, i)) / (usual * stddev(k, i));
-        if (!(distance > threshold)) continue;
-        const double r = residual(k, i);
-        const double factor = std::sqrt(r * r - left_out[g].variance(k, i)) / noise(k, i);
+        const double r = residual(k, i), distance = std::abs(r) / (usual * stddev(k, i));
+        const double likeliest = r * r - left_out[g].variance(k, i);  // variance of its noise
+        if (!(distance > threshold && likeliest > noise(k, i) * noise(k, i))) continue;
+        const double factor = std::sqrt(likeliest) / noise(k, i);
         scale(k, i) *= factor;
         choice.distrusted.push_back({static_cast<int>(g), static_cast<int>(k), static_cast<int>(i), distance, factor});
       }
@@ -188,7 +198,7 @@ class Search {
         best_ = std::move(fitted);
         best_choice_ = choice;
       }
-      if (!next || next->values() == choice.values()) break;
+      if (!next || are_near(*next, choice)) break;
       choice = std::move(*next);
     }
     if (!stopped()) return;
@@ -279,7 +289,11 @@ Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations
     out.report.converged = false;
     out.report.termination = FitReport::interrupted;
   }
-  if (out.report.draws) out.posterior = posterior_of(prior, search.best_choice().observations, out.report);
+  if (!out.report.draws) return out;
+  if (out.report.inducing) out.report.inducing->summary = nullptr;  // which was of the optimum
+  const Workers workers(thread_count(options.n_threads), options.ranks);
+  out.posterior = possible_posterior(prior, search.best_choice().observations, out.report, workers);
+  if (out.report.inducing) out.report.inducing->summary = out.posterior.summary();
   return out;
 }
 

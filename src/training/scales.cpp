@@ -34,18 +34,6 @@ double usable(double spread, double fallback) {
   return spread >= least && std::isfinite(spread) ? spread : fallback;
 }
 
-// of what is measured
-VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) {
-  if (values.cols() == 0) return VectorXd::Zero(values.rows());
-  return values.array().isNaN().select(0, values).cwiseAbs().rowwise().maxCoeff();
-}
-
-// standard deviation of each row; 0 where it does not vary but for rounding
-VectorXd spread_of_rows(const Eigen::Ref<const MatrixXd>& values) {
-  const VectorXd stddev = row_stddev(values);
-  return (stddev.array() > 1e-12 * size_of_rows(values).array()).select(stddev, 0);
-}
-
 // what a group says of the accelerations' spread, or of their size, per row of its view; nothing where the view is of another
 // kind
 template <typename OfRows>
@@ -76,9 +64,9 @@ VectorXd coordinate_scales(const System& system, const std::vector<Observations>
       }
     }
   };
-  add(spread_of_rows);
+  add(row_spread);
   const VectorXd of_spread = variance;
-  add(size_of_rows);
+  add(row_size);
   variance = (of_spread.array() > 0).select(of_spread, variance);
   double kinetic = 0;
   int n_observed = 0;
@@ -178,8 +166,8 @@ VectorXd potential_scales(const VectorXd& of_gradient, const VectorXd& feature_s
 
 // the spread of each row that is observed, or its size, or that of its acceleration
 VectorXd output_scales(const Observations& group, const VectorXd& sigma) {
-  VectorXd stddev = spread_of_rows(group.values());
-  const VectorXd size = size_of_rows(group.values());
+  VectorXd stddev = row_spread(group.values());
+  const VectorXd size = row_size(group.values());
   const bool per_coordinate = group.view().quantity->is_per_coordinate();
   for (Index k = 0; k < stddev.size(); ++k) {
     const int row = group.view().rows[static_cast<std::size_t>(k)];

@@ -107,7 +107,7 @@ TEST(GenerateGrid, ThatIsNoneIsRefusedWithTheMend) {
     EXPECT_FALSE(desk.has("grid.csv")) << grid;
     return outcome.err;
   };
-  for (const std::string item : {"q1", "=5", "q1=", "q1=x", "q1=2.5", "5"}) {
+  for (const std::string item : {"q1", "=5", "q1=", "q1=x", "q1=2.5", "5", "q1=99999999999"}) {
     EXPECT_EQ(refused(item), "gp2: error: --grid: '" + item + "' is not RANGE=POINTS, say q1=5\n");
   }
   EXPECT_EQ(refused("q1=5,q1=6"), "gp2: error: --grid: 'q1' stands twice\n");

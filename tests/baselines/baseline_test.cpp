@@ -1,6 +1,7 @@
 #include "gp2/baselines/baseline.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 
 #include <gmock/gmock.h>
@@ -9,6 +10,7 @@
 
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "input_error.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
 #include "training/objective.hpp"
@@ -92,6 +94,31 @@ TEST(Baseline, LearnsTheAccelerationOfASystemWithoutConstraintsButIsJudgedByThem
   }
 }
 
+TEST(Baseline, StoppedItHasWhatItHasFoundAndWhatFollowsStandsWhereItStarts) {
+  const FitProblem p = problem(Baseline::Kind::se, "models/duffing.toml");
+  std::atomic<bool> stop = false;
+  FitOptions options = quick();
+  options.stop = &stop;
+  options.progress = [&](const Progress&) { stop = true; };
+  const Fit found = fit_of(p, options);
+  EXPECT_FALSE(found.report.converged);
+  EXPECT_EQ(found.report.termination, FitReport::interrupted);
+  ASSERT_EQ(found.report.hyperparameters.size(), p.hyperparameters.size());
+  for (std::size_t k = 0; k < p.hyperparameters.size(); ++k) {
+    const Hyperparameter &start = p.hyperparameters[k], &end = found.report.hyperparameters[k];
+    EXPECT_EQ(end.name, start.name);
+    if (start.owner > 0) {
+      EXPECT_EQ(end.value, start.value) << start.name;
+    }
+  }
+  EXPECT_NEAR(found.report.negative_log_likelihood, found.posterior.negative_log_likelihood(),
+              1e-9 * std::abs(found.report.negative_log_likelihood));
+}
+
+TEST(Baseline, AModelThatHasNoSystemIsRefused) {
+  EXPECT_THAT(test::input_error_of([] { unstandardised(Model(), Baseline::Kind::se); }), HasSubstr("there is no system"));
+}
+
 TEST(Baseline, FarFromDataItReturnsToTheTrainingMean) {
   for (const Baseline::Kind kind : {Baseline::Kind::se, Baseline::Kind::icm}) {
     const FitProblem p = problem(kind);
@@ -99,6 +126,26 @@ TEST(Baseline, FarFromDataItReturnsToTheTrainingMean) {
     const VectorXd mean = fit_of(p).posterior.mean(View::all(View::Quantity::constrained_acceleration, *p.prior.system), far);
     EXPECT_EQ(mean, p.prior.constant_mean);
   }
+}
+
+// in units of its rounding a constant would be astronomically far from every other value
+TEST(Baseline, WhatDoesNotVaryButForRoundingHasTheUnitOne) {
+  const FitProblem p = problem(Baseline::Kind::lmc, "models/duffing.toml");
+  const Observations& observed = p.observations.front();
+  MatrixXd states = observed.states(), values = observed.values();
+  for (MatrixXd* one : {&states, &values}) {
+    one->row(1).setConstant(0.1);
+    (*one)(1, 3) = std::nextafter(0.1, 1);
+  }
+  ASSERT_GT(row_stddev(states)[1], 0);
+  const std::vector<Observations> observations = {{states, observed.view(), values, observed.noise()}};
+  EXPECT_EQ(standardised_by(observations, p.prior, Baseline::Kind::lmc).feature_stddev[1], 1);
+  const std::vector<Hyperparameter> all = baseline_hyperparameters(p.prior, observations);
+  const auto upper_of = [&](const std::string& name) {
+    return std::find_if(all.begin(), all.end(), [&](const Hyperparameter& h) { return h.name == name; })->upper;
+  };
+  EXPECT_EQ(upper_of("se.lengthscale(q2)"), 20);
+  EXPECT_EQ(upper_of("se.sqrt_kappa(ddq2)"), 1e4);
 }
 
 TEST(Baseline, TunesWhatItsCovarianceIsMadeOf) {

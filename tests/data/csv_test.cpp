@@ -380,6 +380,16 @@ TEST(CsvPieces, LinesMayBeLongerThanThem) {
   EXPECT_EQ(table.file()->checksum, checksum(log));
 }
 
+TEST(CsvPieces, TheHeaderMayStandBehindBlankLinesOfAWholePiece) {
+  const TemporaryFolder folder;
+  constexpr std::size_t n_blank = std::size_t{1} << 20;
+  const auto path = folder.write("log.csv", std::string(n_blank, '\n') + "x,y\n1,2\n3,4\n");
+  const CsvTable table = CsvTable::read(path, CsvTable::Keep::numbers, 2);
+  ASSERT_EQ(table.n_rows(), 2);
+  EXPECT_EQ(table.number(1, 1), 4);
+  EXPECT_EQ(table.line(0), static_cast<int>(n_blank) + 2);
+}
+
 TEST(CsvPieces, AnErrorIsThatOfTheFirstLineThatHasOne) {
   const TemporaryFolder folder;
   std::string log = long_log({}, 1);

@@ -288,6 +288,63 @@ dx = [-1, 1]
   }
 }
 
+TEST(CSourceTest, NamesOfTheModelMayBeThoseOfFunctionsOfC) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["square"]
+[parameters]
+pow  = 2.5
+fabs = 0.3
+sinf = 0.7
+[mechanics]
+mass  = [["2 + sin(square)*sinf"]]
+force = ["-fabs*(square + dsquare + 1)^2 - abs(dsquare)*fabs - (square^2 + 4)^pow"]
+[[latent]]
+features   = ["square", "dsquare"]
+directions = "force"
+[truth]
+force = ["-dsquare"]
+[sampling]
+square  = [-1, 1]
+dsquare = [-1, 1]
+)toml",
+                                   "names");
+  const View view = View::constrained_acceleration(*model.system);
+  Problem p{model.name, make_prior(model, {Prior::Mean::force, std::nullopt}), {}, {}, test::draw(model, 20, export_seed).states,
+            {}};
+  RandomStream random(export_seed);
+  p.observations.push_back(test::observe(model, view, p.queries, random));
+  p.values = test::random_values(p.prior, p.observations, random);
+  const Posterior posterior = test::posterior_of(p);
+  for (const bool portable : {false, true}) {
+    CSourceOptions options;
+    options.portable_math = portable;
+    Exported c(export_c(posterior, view, options), "gp2_model", "gcc -O2 -ffp-contract=off");
+    EXPECT_EQ(c.self_test(c.workspace()), 0) << portable;
+  }
+}
+
+TEST(CSourceTest, TellsWhereAConstraintIsObeyed) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y", "z"]
+[mechanics]
+mass = [["0.2", "0", "0"], ["0", "0.2", "0"], ["0", "0", "0.2"]]
+[constraints]
+position = [{ expr = "z - 0.5*x^2", when = "x <= 0" }]
+velocity = ["dx + dy"]
+[[latent]]
+features   = ["dx"]
+directions = "force"
+)toml",
+                                   "bead");
+  const View view = View::constrained_acceleration(*model.system);
+  RandomStream random(export_seed);
+  Problem p{model.name, make_prior(model, {Prior::Mean::force, std::nullopt}), {}, {}, test::random_matrix(7, 12, random), {}};
+  p.observations.push_back(test::observe(model, view, p.queries, random));
+  p.values = test::random_values(p.prior, p.observations, random);
+  EXPECT_THAT(export_c(test::posterior_of(p), view).header,
+              HasSubstr(" * It obeys z - 0.5*x^2 = 0 where x <= 0.\n * It obeys dx + dy = 0.\n"));
+}
+
 // What is left of terms that cancel is rounded as these are.
 TEST(CSourceTest, IsThePredictorWhereALoadIsAboutToChangeItsSign) {
   const Model& model = test::model("experiments/mechanisms/rubbing_bead.toml");

@@ -9,6 +9,7 @@
 #include <nlohmann/json.hpp>
 
 #include "gp2/base/version.hpp"
+#include "gp2/inference/leave_one_out.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "io_testing.hpp"
@@ -215,6 +216,37 @@ TEST(FitFile, TheReportSurvives) {
   }
 }
 
+TEST(FitFile, WhatIsKnownOfDelaysSurvives) {
+  FitFile fit = fit_of(Model::parse(R"toml(
+name        = "cart"
+coordinates = ["x"]
+inputs      = [{ name = "u", delay = { value = 0.02, estimate = true }, lag = { value = 0.03, estimate = true } }]
+[mechanics]
+mass  = [["1.5"]]
+force = ["u"]
+[truth]
+force = ["0"]
+[noise]
+ddq = 0.1
+[sampling]
+x  = [-1, 1]
+dx = [-1, 1]
+u  = [-1, 1]
+)toml",
+                                    "cart"));
+  constexpr double infinity = std::numeric_limits<double>::infinity(), nan = std::numeric_limits<double>::quiet_NaN();
+  for (const double stddev : {0.001, infinity, nan}) {
+    fit.report.actuators = {{"u.delay", 0.02, stddev, 0, 0.1}, {"u.lag", 0.03, 0.002, 0, 0.2}};
+    const std::vector<ActuatorEstimate> read = written_and_read(fit).report.actuators;
+    ASSERT_EQ(read.size(), 2U);
+    EXPECT_TRUE(read[0].stddev == stddev || (std::isnan(read[0].stddev) && std::isnan(stddev))) << stddev;
+    EXPECT_EQ(std::tie(read[0].name, read[0].value, read[0].lower, read[0].upper),
+              std::tie(fit.report.actuators[0].name, fit.report.actuators[0].value, fit.report.actuators[0].lower,
+                       fit.report.actuators[0].upper));
+    EXPECT_EQ(read[1].stddev, 0.002);
+  }
+}
+
 TEST(FitFile, StandardErrorsSurvive) {
   FitFile fit = fit_of(unicycle());
   EXPECT_FALSE(written_json(fit).at("report").contains("uncertainty"));
@@ -316,6 +348,16 @@ TEST(FitFile, InducingPointsSurvive) {
   const Fit exact{fit_of(unicycle()).posterior(), fit.report};
   EXPECT_EQ(input_error_of([&] { FitFile(fit.model, fit.prior_options, exact); }),
             "FitFile: the hyperparameters of the report are not those of the posterior");
+}
+
+TEST(FitFile, WhatWasForgottenSurvives) {
+  FitFile fit = fit_through_points();
+  fit.take_data(forget(fit.posterior(), 0.25));
+  EXPECT_FALSE(fit.report.inducing->stretches.has_value()) << "scores of before";
+  const FitFile read = written_and_read(fit);
+  const auto left_out = [](const FitFile& file) { return leave_one_out(file.posterior()).front().variance; };
+  EXPECT_EQ(left_out(read), left_out(fit));
+  EXPECT_NE(left_out(read), left_out(fit_through_points()));
 }
 
 TEST(FitFile, TheSameFitGivesTheSameBytes) {
@@ -466,6 +508,11 @@ TEST_F(DamagedFit, InducingPointsThatDoNotHoldTogetherAreRefused) {
   EXPECT_EQ(refused_summary([](Json& s) { s["step"] = 0; }), "a step of 0 states is not possible");
   EXPECT_EQ(refused_summary([](Json& s) { s["states"][0] = -1; }), "-1 stands where a number of states must");
   EXPECT_THAT(refused_summary([](Json& s) { s["states"].push_back(1); }), StartsWith("numbers of states of 2 of 1 observations"));
+  EXPECT_EQ(refused_summary([](Json& s) { s["shares"] = {std::vector<double>(6, 0.5)}; }), "");
+  EXPECT_EQ(refused_summary([](Json& s) { s["shares"] = {std::vector<double>(5, 0.5)}; }), "shares of some states only");
+  EXPECT_EQ(refused_summary([](Json& s) { s["shares"] = Json::array(); }), "shares of some states only");
+  EXPECT_EQ(refused_summary([](Json& s) { s["shares"] = {std::vector<double>(6, 1.5)}; }),
+            "shares of states must be from 0 to 1");
   EXPECT_EQ(refused_summary([](Json& s) { s["components"][0]["c"] = "00"; }),
             fmt::format("2 hexadecimal digits, expected {}", 16 * inducing.at("variables").get<int>()));
   EXPECT_EQ(refused_summary([](Json& s) {
@@ -703,6 +750,10 @@ TEST_F(DamagedFit, ValuesOutOfPlaceAreNamed) {
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["noise_scale"] = Json::object(); }),
             "the values of 'ddq1' are missing");
   EXPECT_EQ(error_after([](Json& json) { json["prior"]["mean"] = "constant"; }), "'constant' is no prior mean");
+  EXPECT_EQ(error_after([](Json& json) {
+              json["hyperparameters"][0]["hyperprior"] = {{"median", 1}, {"log_stddev", 0}};
+            }),
+            "the deviation of a prior must be positive, got 0");
   EXPECT_EQ(error_after([](Json& json) { json["prior"]["directions"] = "up"; }), "'up' is no choice of directions");
   EXPECT_THAT(error_after([](Json& json) { json["model"]["text"] = "coordinates = 3"; }),
               HasSubstr("unicycle.toml:1: coordinates: expected an array"));

@@ -140,6 +140,15 @@ TEST(DataDistance, NeighboursInTimeAreNoNeighbours) {
   EXPECT_NEAR(distances(p.of(line), aside)[0], 0.05 / 0.051, 1e-9);
 }
 
+TEST(DataDistance, StatesThatAreMeasuredTwiceAreOne) {
+  const Plane p = plane("se", Eigen::Vector2d(1, 1));
+  const MatrixXd once = drawn_states(p, 15, 10), asked = drawn_states(p, 20, 11);
+  MatrixXd twice(once.rows(), 30);
+  twice << once, once;
+  const VectorXd expected = distances(p.of(once), asked), got = distances(p.of(twice), asked);
+  EXPECT_LE((got - expected).cwiseAbs().maxCoeff(), 1e-12 * expected.maxCoeff());
+}
+
 TEST(DataDistance, IsSaidWhereThereIsNothingToCompareWith) {
   const Plane p = plane("se", Eigen::Vector2d(1, 1));
   const MatrixXd states = drawn_states(p, 3, 7);
@@ -165,6 +174,31 @@ TEST(DataDistance, ThePredictorSaysTheSameAndAllocatesNothing) {
       EXPECT_NEAR(got, expected[i], 1e-12 * expected[i]);
     }
     EXPECT_EQ(posterior.distance_from_data(acceleration_of(posterior), p.queries, 4), expected);
+  }
+}
+
+// features hold the values that parameters have where the state is
+TEST(DataDistance, UnderAnotherSystemIsThatOfItsFeatures) {
+  const Plane p = plane("se", Eigen::Vector2d(1, 1));
+  const auto with_factor = [&](const char* c) {
+    return Model::parse(test::changed(p.model.text, {{"[mechanics]", fmt::format("[parameters]\nc = {}\n[mechanics]", c)},
+                                                     {"\"dx\", \"dy\"", "\"c*dx\", \"dy\""}}),
+                        "plane.toml");
+  };
+  const Model home = with_factor("1.0"), other = with_factor("3.0");
+  ModelValues values = p.values;
+  values.parameters = VectorXd::Ones(1);
+  const Posterior posterior(make_prior(home), {p.at(drawn_states(p, 40, 8))}, values);
+  const View there = test::under(acceleration_of(posterior), make_other_system(home, other));
+  const MatrixXd states = drawn_states(p, 10, 9);
+  MatrixXd faster = states;
+  faster.row(2) *= 3;
+  const VectorXd expected = distances(posterior, faster), got = posterior.distance_from_data(there, states);
+  EXPECT_LE((got - expected).cwiseAbs().maxCoeff(), 1e-12 * expected.maxCoeff());
+  const Predictor predictor(posterior, there);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  for (Index i = 0; i < states.cols(); ++i) {
+    EXPECT_NEAR(predictor.distance_from_data(states.col(i), workspace), expected[i], 1e-12 * expected[i]);
   }
 }
 

@@ -82,6 +82,7 @@ TEST(Inducing, PointsAtEveryStateChangeNothing) {
       }
     };
     expect_alike_left_out(left_out.values, expected_left_out.values);
+    expect_alike_left_out(left_out.rows, expected_left_out.rows);
     if (!expected_left_out.stretches.empty()) expect_alike_left_out(left_out.stretches, expected_left_out.stretches);
     EXPECT_NEAR(left_out_by_points(p.prior, p.observations, through.values).sum(), 0, tolerance * (1 + std::abs(exact.value)));
   }
@@ -170,6 +171,7 @@ TEST(Inducing, WhatPointsLeaveOutOfADiscrepancyIsNoise) {
       for (const auto part : {&LeaveOneOut::mean, &LeaveOneOut::variance}) {
         EXPECT_LE(largest(left_out.values[0].*part - wanted.values[0].*part),
                   1e2 * tolerance * (1 + largest(wanted.values[0].*part)));
+        EXPECT_LE(largest(left_out.rows[0].*part - wanted.rows[0].*part), 1e2 * tolerance * (1 + largest(wanted.rows[0].*part)));
       }
     }
   }
@@ -332,6 +334,17 @@ TEST(Inducing, WhatIsForgottenCountsAsIfItsNoiseHadBeenLarger) {
     const double tolerance = 1e2 * test::rounding(p);
     EXPECT_LE(largest(got.mean - wanted.mean), tolerance * (1 + largest(wanted.mean)));
     EXPECT_LE(largest(got.covariance - wanted.covariance), tolerance * (1 + largest(wanted.covariance)));
+    constexpr int n_stretches = LeftOut::n_stretches;
+    const LeftOut left_out = leave_out(faded, n_stretches), wanted_out = leave_out(expected, n_stretches);
+    for (const auto values : {&LeftOut::values, &LeftOut::rows, &LeftOut::stretches}) {
+      for (const auto part : {&LeaveOneOut::mean, &LeaveOneOut::variance}) {
+        const MatrixXd &is = (left_out.*values).front().*part, &should_be = (wanted_out.*values).front().*part;
+        EXPECT_LE(largest(is - should_be), 1e2 * tolerance * (1 + largest(should_be)));
+      }
+    }
+    // a summary knows them together only
+    const Posterior read = Posterior::of_summary(p.prior, faded.observations(), {faded.values()}, *faded.summary());
+    EXPECT_TRUE(leave_out(read, n_stretches).stretches.empty());
     ++n_forgotten;
   }
   EXPECT_GT(n_forgotten, 5);
@@ -363,6 +376,11 @@ TEST(Inducing, AStretchAtRestIsNoContradiction) {
 }
 
 TEST(Inducing, BadRequestsAreErrors) {
+  const Problem any = exact_problems().front(), through = with_points(any, 5);
+  const Likelihood likelihood(any.prior, any.observations, through.values, {});
+  Likelihood::Workspace workspace;
+  EXPECT_EQ(test::input_error_of([&] { likelihood.evaluate(any.values, nullptr, workspace); }),
+            "values: the likelihood was made through inducing points, and these have none");
   const Problem p = exact_problems().front();
   const auto choose = [&](InducingOptions options) {
     return test::input_error_of([&] { static_cast<void>(choose_inducing_points(p.prior, p.observations, p.values, options)); });

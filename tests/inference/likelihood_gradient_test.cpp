@@ -205,6 +205,23 @@ TEST(LikelihoodGradientTest, MatchesDifferencesWhereAPriorIsMadeLinear) {
   }
 }
 
+// a parameter that the other system has not changes nothing there, nor the noise of its soft constraints
+TEST(LikelihoodGradientTest, MatchesDifferencesWhereAnotherSystemSlipsToo) {
+  const Model& model = test::model_with_a_slipping_wheel();
+  const Model other = Model::parse(
+      test::changed(model.text, {{"m = 2.0", "m = 2.6"}, {"e = 0.3", "e = { value = 0.3, estimate = true }"}}), "other wheels");
+  int n_problems = 0;
+  for (Problem p : test::problems(9, likelihood_gradient_seed)) {
+    if (p.name != "slipping wheels") continue;
+    ++n_problems;
+    const auto elsewhere = make_other_system(model, other, {p.prior.mean, std::nullopt, false});
+    p.observations.push_back(p.observations[0].with_view(test::under(p.observations[0].view(), elsewhere)));
+    p.values.noise_stddev.push_back(p.values.noise_stddev[0]);
+    expect_gradient(p);
+  }
+  EXPECT_EQ(n_problems, 2);
+}
+
 // the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ
 TEST(LikelihoodGradientTest, MatchesDifferencesOverSeveralTiles) {
   int n_problems = 0;

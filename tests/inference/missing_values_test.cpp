@@ -357,6 +357,99 @@ TEST(LeaveOutTest, EachStretchIsPredictedAsByAPosteriorThatHasNotSeenIt) {
   }
 }
 
+// of one log with accelerations what also measures forces, at the same states
+std::vector<Problem> with_forces_beside(const std::vector<Problem>& problems) {
+  std::vector<Problem> all;
+  for (const Problem& p : problems) {
+    const Observations& group = p.observations.front();
+    const System& system = *p.prior.system;
+    if (p.observations.size() > 1 || !group.view().is_of_ddq() || group.view().other_system || system.nc() == 0) continue;
+    RandomStream random(missing_values_seed, 77 + all.size());
+    const View view = View::constraint_force(system);
+    MatrixXd forces(view.size(), group.n_data());
+    for (double& one : forces.reshaped()) one = random.normal();
+    Problem& both = all.emplace_back(p);
+    both.name += ", with forces";
+    both.values.noise_stddev.push_back(VectorXd::Constant(view.size(), 0.3));
+    both.observations.emplace_back(group.states(), view, forces, both.values.noise_stddev.back());
+    if (all.size() == 3) break;
+  }
+  return all;
+}
+
+// all that is measured at a state goes, and one value alone as a value does
+TEST(LeaveOutTest, EachRowIsPredictedAsByAPosteriorThatHasNotSeenIt) {
+  std::vector<Problem> all = gappy_problems();
+  const std::vector<Problem> with_forces = with_forces_beside(all);
+  EXPECT_EQ(with_forces.size(), 3U);
+  all.insert(all.end(), with_forces.begin(), with_forces.end());
+  for (const Problem& p : all) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
+    const LeftOut left_out = leave_out(test::posterior_of(p), 0);
+    ASSERT_EQ(left_out.rows.size(), p.observations.size());
+    const bool has_forces = p.name.ends_with("with forces");
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      const Observations& group = p.observations[g];
+      for (const int i : {0, 1, 3}) {
+        if (i >= group.n_data()) continue;
+        Problem without = p;
+        Index n_measured = 0;
+        for (std::size_t h = 0; h < p.observations.size(); ++h) {
+          if (h != g && !has_forces) continue;
+          MatrixXd values = p.observations[h].values();
+          n_measured += values.col(i).array().isFinite().count();
+          values.col(i).setConstant(nan);
+          without.observations[h] = p.observations[h].with_values(values);
+        }
+        const Posterior posterior = test::posterior_of(without);
+        const Posterior::Marginal expected = posterior.marginal(group.view(), group.states().col(i));
+        const MatrixXd slip = with_slip(posterior, group.view(), group.states().col(i), MatrixXd::Zero(group.view().size(), 1));
+        const LeaveOneOut &row = left_out.rows[g], &value = left_out.values[g];
+        for (Index k = 0; k < group.values().rows(); ++k) {
+          EXPECT_EQ(std::isnan(row.mean(k, i)), std::isnan(group.values()(k, i)));
+          if (std::isnan(group.values()(k, i))) continue;
+          const double variance = std::pow(expected.stddev()(k, 0), 2) + std::pow(slip(k, 0), 2);
+          const double size = largest(expected.mean) + std::sqrt(variance) + group.noise().stddev()[k];
+          EXPECT_NEAR(row.mean(k, i), expected.mean(k, 0), gappy_rounding(p) * (1 + size));
+          EXPECT_NEAR(row.variance(k, i), variance, gappy_rounding(p) * (1 + size * size));
+          if (n_measured > 1) continue;
+          EXPECT_EQ(row.mean(k, i), value.mean(k, i));
+          EXPECT_EQ(row.variance(k, i), value.variance(k, i));
+        }
+      }
+    }
+  }
+}
+
+TEST(LeaveOutTest, WhatMeasuresAStateAgainIsAnotherRow) {
+  std::vector<Problem> all = test::problems(9, missing_values_seed);
+  Problem& p = *std::ranges::find(all, "surface, every row", &Problem::name);
+  const LeftOut apart = leave_out(test::posterior_of(p), 0);
+  const Index n = p.observations.front().n_data();
+  p.observations.push_back(p.observations.front());
+  p.values.noise_stddev.push_back(p.values.noise_stddev.front());
+  const LeftOut twice = leave_out(test::posterior_of(p), 0);
+  EXPECT_EQ(twice.rows.front().mean.cols(), n);
+  EXPECT_TRUE((twice.rows.front().variance.array() < apart.rows.front().variance.array()).all());
+}
+
+TEST(LeaveOutTest, OfALogWithoutTimeOrderHasNoStretchesWhateverAnotherHas) {
+  std::vector<Problem> all = test::problems(30, missing_values_seed);
+  Problem& p = *std::ranges::find(all, "surface, every row", &Problem::name);
+  const Observations group = p.observations.front();
+  const int t = p.prior.system->layout().t();
+  MatrixXd timed = group.states(), untimed = timed;
+  timed.row(t).setLinSpaced(0, 1);
+  untimed.row(t).setConstant(nan);
+  p.observations = {group.with_states(timed), group.with_states(untimed)};
+  p.values.noise_stddev.push_back(p.values.noise_stddev.front());
+  EXPECT_FALSE(cross_validate(test::posterior_of(p), false).stretches.has_value());
+  EXPECT_TRUE(cross_validate(test::posterior_of(p), true).stretches.has_value());
+  p.observations.pop_back();
+  p.values.noise_stddev.pop_back();
+  EXPECT_TRUE(cross_validate(test::posterior_of(p), false).stretches.has_value());
+}
+
 TEST(LeaveOutTest, SaysTheSameOfEachValueWhateverTheStretches) {
   const Problem p = gappy_problems().front();
   const std::vector<LeaveOneOut> values = leave_one_out(test::posterior_of(p));

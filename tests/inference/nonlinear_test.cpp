@@ -972,6 +972,25 @@ TEST(NonlinearPosterior, OfDataThatComeAndGoIsTheOneOfThoseThatAreThere) {
                              of_both));
   expect_same(remove_oldest(Posterior(two), 15), Posterior(fitted.prior, {rows(20, 5), noisier(15, 5)}, of_both));
   expect_same(remove_oldest(remove_oldest(Posterior(two), 12), 3), remove_oldest(Posterior(two), 15));
+  // where all go that were added to the prior it is the prior again
+  const Posterior prior = first.without_data(), emptied = remove_oldest(update(Posterior(prior), rows(0, 15)), 15);
+  EXPECT_EQ(emptied.mean(view, states), prior.mean(view, states));
+  EXPECT_EQ(emptied.marginal(view, states).covariance, prior.marginal(view, states).covariance);
+}
+
+TEST(NonlinearPosterior, LeavesOutAStateOfSumsAsOneOfValues) {
+  const Fitted fitted(test::model_that_rubs(), 25);
+  const Observations& alone = fitted.observations.front();
+  std::vector<WeightedSum> sums;
+  for (int k = 0; k < alone.view().size(); ++k) {
+    for (int i = 0; i < alone.n_data(); ++i) sums.push_back({k, i, VectorXd::Ones(1), alone.values()(k, i), VectorXd::Ones(1)});
+  }
+  const ModelValues values =
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+  const LeaveOneOut of_sums = leave_one_out(Posterior(fitted.prior, {alone.with_sums(sums)}, values)).front(),
+                    of_values = leave_out(Posterior(fitted.prior, {alone}, values), alone.n_data()).stretches.front();
+  EXPECT_LE(test::largest(of_sums.mean - of_values.mean), 1e-4 * test::largest(of_values.mean));
+  EXPECT_LE(test::largest(of_sums.variance - of_values.variance), 1e-4 * test::largest(of_values.variance));
 }
 
 // ---------------------------------------------------------------- through inducing points
@@ -1016,6 +1035,8 @@ TEST(NonlinearInducing, PointsAtEveryStateChangeNothing) {
     const LeftOut got = leave_out(through, LeftOut::n_stretches), wanted = leave_out(exact, LeftOut::n_stretches);
     for (const auto part : {&LeaveOneOut::mean, &LeaveOneOut::variance}) {
       EXPECT_LE(test::largest(got.values[0].*part - wanted.values[0].*part), 1e-6 * (1 + test::largest(wanted.values[0].*part)));
+      // a row is told by less than a value is, and rounding counts by the square of that
+      EXPECT_LE(test::largest(got.rows[0].*part - wanted.rows[0].*part), 2e-5 * (1 + test::largest(wanted.rows[0].*part)));
       EXPECT_LE(test::largest(got.stretches[0].*part - wanted.stretches[0].*part),
                 1e-6 * (1 + test::largest(wanted.stretches[0].*part)));
     }
@@ -1191,6 +1212,15 @@ TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
   expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },
               {"only directions"});
   expect_says([&] { rubbing_bead("lambda", "constant", latent + "[\"x\"]\npositive = true"); }, {"directions of its own"});
+  // a part of the motion is no observation, of a posterior that grows either
+  const Fitted fitted(test::model_that_rubs(), 25);
+  const Observations& all = fitted.observations.front();
+  const Posterior posterior(
+      fitted.prior, fitted.observations,
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+  View part = all.view();
+  part.latent = 0;
+  expect_says([&] { static_cast<void>(update(Posterior(posterior), all.with_view(part))); }, {"from the whole motion"});
 }
 
 }  // namespace

@@ -102,6 +102,21 @@ TEST_P(NotFinite, IsRefusedAtEveryDoorByStateAndName) {
   for (const auto& [name, use] : doors) EXPECT_THAT(input_error_of(use), HasSubstr(expected)) << name;
 }
 
+// States are predicted in blocks, but counted among all.
+TEST_P(NotFinite, IsNumberedAmongAllStates) {
+  const std::vector<Observations> sound = {observe(sound_)};
+  const Posterior posterior(prior_, sound, model_values(prior_, sound, default_hyperparameters(prior_, sound, {}, Protocol())));
+  const View view = View::constrained_acceleration(*prior_.system);
+  MatrixXd many = sound_.col(0).replicate(1, 400);
+  many.col(290) = many.col(399) = broken_.col(1);
+  for (const int n_threads : {1, 2}) {
+    for (const std::string& error : {input_error_of([&] { static_cast<void>(posterior.mean(view, many, n_threads)); }),
+                                     input_error_of([&] { static_cast<void>(posterior.marginal(view, many, n_threads)); })}) {
+      EXPECT_THAT(error, HasSubstr("is not a finite number at state 291 (x = -1"));
+    }
+  }
+}
+
 TEST_P(NotFinite, IsAStatusOfThePredictor) {
   const std::vector<Observations> sound = {observe(sound_)};
   const Posterior posterior(prior_, sound, model_values(prior_, sound, default_hyperparameters(prior_, sound, {}, Protocol())));

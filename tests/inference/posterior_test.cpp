@@ -269,13 +269,15 @@ TEST(PosteriorTest, AVarianceThatRoundingMadeNegativeIsZeroAndCounted) {
   const View view = View::all(Quantity::unconstrained_acceleration, *model.system);
   std::vector<Observations> observations{{data.states, view, data.accelerations, VectorXd::Constant(3, 1e-9), false}};
   RandomStream random(posterior_seed);
-  const Posterior::Marginal marginal =
-      Posterior(prior, observations, test::random_values(prior, observations, random)).marginal(view, data.states);
+  const ModelValues values = test::random_values(prior, observations, random);
+  const Posterior::Marginal marginal = Posterior(prior, observations, values).marginal(view, data.states);
   const MatrixXd stddev = marginal.stddev();
   EXPECT_TRUE(stddev.allFinite());
   EXPECT_GT(marginal.n_clipped, 0) << "nothing was tested";
   // others came out as exactly zero
   EXPECT_GE((stddev.array() == 0).count(), marginal.n_clipped);
+  const Posterior mixture = Posterior::mixture(prior, observations, {values, values});
+  EXPECT_EQ(mixture.marginal(view, data.states).n_clipped, 2 * marginal.n_clipped);
 }
 
 TEST(PosteriorTest, OfASystemWithoutConstraintsIsAPlainGaussianProcess) {

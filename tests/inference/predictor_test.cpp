@@ -114,6 +114,41 @@ TEST(PredictorTest, ADeviationFarBelowThePriorsIsThatOfThePosterior) {
   }
 }
 
+// Accelerations that the constraint decides tell nothing of the latents: there are states, but no rows.
+TEST(PredictorTest, OfDataThatTellNothingIsThePrior) {
+  const Model model = Model::parse(R"toml(
+name        = "bead that is led"
+coordinates = ["x"]
+[mechanics]
+mass  = [["2"]]
+[constraints]
+position = ["x - sin(t)"]
+[[latent]]
+kernel     = "se"
+features   = ["x", "dx"]
+directions = "force"
+)toml",
+                                   "bead that is led");
+  RandomStream random(predictor_seed);
+  MatrixXd states(3, 50);
+  for (double& entry : states.reshaped()) entry = random.normal();
+  const View ddq = View::constrained_acceleration(*model.system), a_bar = View::unconstrained_acceleration(*model.system);
+  const std::vector<Observations> observations = {{states, ddq, MatrixXd::Zero(1, 50), VectorXd::Ones(1)}};
+  const Posterior posterior(make_prior(model), observations, test::random_values(make_prior(model), observations, random));
+  ASSERT_EQ(posterior.reduced_size(), 0);
+  const Posterior::Marginal expected = posterior.without_data().marginal(a_bar, states);
+  for (const Storage storage : {Storage::double_precision, Storage::single_precision}) {
+    const Predictor predictor(posterior, a_bar, {.storage = storage});
+    Predictor::Workspace workspace = predictor.make_workspace();
+    VectorXd mean(1), stddev(1);
+    for (Index i = 0; i < states.cols(); ++i) {
+      ASSERT_EQ(predictor.mean_and_stddev(states.col(i), mean, stddev, workspace), Status::ok);
+      EXPECT_EQ(mean[0], 0);
+      EXPECT_NEAR(stddev[0], expected.stddev()(0, i), 1e-12 * stddev[0]);
+    }
+  }
+}
+
 TEST(PredictorTest, IsThePosteriorInEveryView) {
   for (const Problem& p : predictor_problems()) {
     const Posterior posterior(p.prior, p.observations, p.values);

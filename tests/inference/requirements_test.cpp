@@ -363,6 +363,14 @@ TEST(Requirements, WhatWasMovedAwaySaysSo) {
   // NOLINTEND(bugprone-use-after-move)
 }
 
+TEST(Requirements, ThereAreNoFewerSamplesThanNone) {
+  const Surface s;
+  EXPECT_EQ(input_error_of([&] {
+              static_cast<void>(s.posterior.sample({{s.ddq, s.data.states}}, -1, 0));
+            }),
+            "Posterior::sample: n_samples must not be negative, got -1");
+}
+
 TEST(Requirements, AnEvaluationHasATargetForEachRowAndState) {
   const Surface s;
   const auto refusal = [&](const std::vector<int>& rows, const MatrixXd& targets) {
@@ -370,6 +378,12 @@ TEST(Requirements, AnEvaluationHasATargetForEachRowAndState) {
   };
   EXPECT_EQ(refusal({0, 1}, s.data.accelerations), "evaluate_predictions: targets must be 2 × 7, got 3 × 7");
   EXPECT_THAT(refusal({0, 7}, MatrixXd::Ones(2, 7)), HasSubstr("there are the rows 0 … 2, got 7"));
+  EXPECT_EQ(
+      input_error_of([&] {
+        evaluate_predictions(s.posterior, s.data.states, {0, 1, 2}, s.data.accelerations, {.noise_stddev = MatrixXd::Ones(3, 1)});
+      }),
+      "evaluate_predictions: noise_stddev must be 3 × 7, got 3 × 1");
+  EXPECT_EQ(input_error_of([&] { pit_histogram(VectorXd::Zero(3), 0); }), "pit_histogram: n_bins must be 1 or more, got 0");
   EXPECT_EQ(input_error_of([&] {
               max_constraint_error(*s.model.system, s.data.states, s.model.system->parameter_values(), MatrixXd::Ones(3, 6));
             }),

@@ -158,7 +158,7 @@ TEST(CrossValidation, OfStretchesIsWorseThanOfSingleRowsOfASlowMotion) {
   EXPECT_EQ(rows.n, 60);
   EXPECT_GT(stretches.nrmse, 1.2 * rows.nrmse);
   EXPECT_EQ(fit.cross_validation->text(),
-            fmt::format("left out one by one: nrmse {:.3g}, 95 % coverage {:.3g}; in 5 stretches of the log: {:.3g}, {:.3g}",
+            fmt::format("left out row by row: nrmse {:.3g}, 95 % coverage {:.3g}; in 5 stretches of the log: {:.3g}, {:.3g}",
                         rows.nrmse, rows.coverage95, stretches.nrmse, stretches.coverage95));
 
   // the same figures by a posterior that has not seen the stretch

@@ -1,3 +1,4 @@
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 
 #include "gp2/jobs/check_job.hpp"
@@ -53,8 +54,34 @@ TEST(FitNotes, NameWhatEndedAtABound) {
       ElementsAre(HasSubstr("m ended"), StartsWith("noise of ddx, noise of ddy ended at the lower bound: the log has less")));
   // where nothing was optimised nothing ended anywhere
   report.iterations = 0;
-  report.hyperparameters.resize(2);
   EXPECT_THAT(notes_of(report, free), testing::IsEmpty());
+  // but what is likeliest already has
+  report.converged = true;
+  EXPECT_THAT(notes_of(report, free), testing::SizeIs(2));
+}
+
+TEST(FitNotes, TellOfFewValuesForWhatIsEstimated) {
+  FitReport report;
+  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "m", 1, 0.5, 2)};
+  const auto notes = [&](int n_rows, const std::string& constraints) {
+    std::string text = "x,y,dx,dy,ddx,ddy\n";
+    for (int i = 0; i < n_rows; ++i) text += fmt::format("{},{},{},{},{},0\n", i, i + 1, i % 3, i % 4, i % 5);
+    FitOptions nothing;
+    nothing.max_iterations = 0;
+    std::vector<std::string> out;
+    const FitProblem problem = problem_of(constrained_cart(constraints), CsvTable::parse(text, "log.csv"));
+    add_few_values_note(report, fit(problem, nothing).posterior, out);
+    return out;
+  };
+  EXPECT_THAT(notes(4, ""), testing::IsEmpty()) << "no standard errors";
+  report.uncertainty.emplace();
+  EXPECT_THAT(notes(4, ""),
+              ElementsAre(StartsWith("warning: 8 measured values are few for 1 estimated parameters and 2 functions:")));
+  EXPECT_THAT(notes(5, ""), testing::IsEmpty());
+  // ddy follows from the constraint
+  EXPECT_THAT(notes(8, "[constraints]\nacceleration = ['ddy']\n"), ElementsAre(StartsWith("warning: 8 measured values")));
+  report.draws.emplace();
+  EXPECT_THAT(notes(4, ""), testing::IsEmpty()) << "what is not known of hyperparameters is in the draws";
 }
 
 TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {
@@ -71,6 +98,36 @@ TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {
   const Model two = Model::parse(plain.text + "[[latent]]\nkernel = 'se'\nfeatures = ['dy']\n", "cart");
   EXPECT_THAT(input_error_of([&] { make_fit_problem(two, log, options); }),
               HasSubstr("`protocol=paper` has one latent, on the acceleration, but 'cart' has 2"));
+}
+
+// What a latent reads of the load of the constraints may be none, or a choice.
+TEST(FitNotes, TellOfALatentThatActsNowhereAndOfLoadsThatAreShared) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0,3,0,5,0.1\n2,0,4,0,6,0\n3,0,5,0,6,-0.1\n", "log.csv");
+  const auto told = [&](const std::string& constraints, const std::string& load) {
+    const Model model = Model::parse(
+        "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\nforce = ['0', '-9.81']\n[constraints]\n"
+        "position = " +
+            constraints +
+            "\n[[latent]]\nname = 'mu'\nkernel = 'constant'\nfeatures = ['dx']\ndirections = { force = [['-dx*max(0, " + load +
+            ")'], ['0']] }\n",
+        "sled");
+    FitProblemOptions options;
+    options.noise_stddev = 0.1;
+    std::string all;
+    for (const std::string& note : make_fit_problem(model, log, options).notes) all += note + "\n";
+    for (const Finding& finding : check(model, &log, {}))
+      all += (finding.level == Finding::Level::good ? "ok " : "check: ") + finding.text + "\n";
+    return all;
+  };
+  const std::string sound = told("['y']", "lambda0(1)");
+  EXPECT_THAT(sound, Not(HasSubstr("acts at 0")));
+  EXPECT_THAT(sound, Not(HasSubstr("follows from others")));
+  const std::string idle = told("['y']", "-lambda0(1)");
+  EXPECT_THAT(idle, HasSubstr("warning: latent 'mu' acts at 0 of 3 states: its direction is 0 there"));
+  EXPECT_THAT(idle, HasSubstr("check: latent 'mu' acts at 0 of 3 states"));
+  const std::string shared = told("['y', '2*y']", "lambda0(2)");
+  EXPECT_THAT(shared, HasSubstr("warning: log.csv: lambda0(2): the constraint '2*y' follows from others"));
+  EXPECT_THAT(shared, HasSubstr("check: lambda0(2): the constraint '2*y' follows from others"));
 }
 
 TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
@@ -177,6 +234,7 @@ CrossValidation scores_of(double noise, double one_by_one, double stretches, dou
   scores.one_by_one.nrmse = one_by_one;
   scores.one_by_one.n = n;
   scores.one_by_one.coverage95 = 0.95;
+  scores.values = scores.one_by_one;
   scores.stretches = scores.one_by_one;
   scores.stretches->nrmse = stretches;
   scores.stretches->coverage95 = coverage95;

@@ -36,11 +36,24 @@ TEST(FitTime, IsToldWhereAnEvaluationTakesLong) {
                                   "a fit takes hundreds: it can be interrupted at any time"));
   EXPECT_THAT(notes[1], HasSubstr("about 8 min here"));
   EXPECT_THAT(notes[2], HasSubstr("about 6 h here"));
+  EXPECT_THAT(notes[2], HasSubstr("inducing points"));
+  // which a baseline cannot have
+  note_time(42, 9000, notes, /*takes_points=*/false);
+  EXPECT_THAT(notes[3], testing::Not(HasSubstr("inducing")));
 }
 
 TEST(FitTime, OfASmallFitIsNotTold) {
   std::vector<std::string> notes;
   note_time(surface_of_states(50), {}, 100, notes);
+  EXPECT_TRUE(notes.empty());
+}
+
+// of whose states none can be left out
+TEST(FitTime, OfAFitToWindowsIsNotTold) {
+  FitProblem problem = surface_of_states(50);
+  problem.observations[0] = problem.observations[0].with_sums({{0, 0, Eigen::VectorXd::Ones(3), 1, Eigen::VectorXd::Ones(1)}});
+  std::vector<std::string> notes;
+  note_time(problem, {}, 5000, notes);
   EXPECT_TRUE(notes.empty());
 }
 

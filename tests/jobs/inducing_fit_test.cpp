@@ -214,6 +214,21 @@ TEST(InducingFit, HyperparametersDrawnFromSomeRowsMixWhatAllTell) {
   }
 }
 
+int n_points_of_discrepancy(const char* model) {
+  FitRequest request = request_of_rows(1000, model);
+  request.inducing = 400;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_EQ(outcome.file.prior().latents.back().name, "discrepancy");
+  EXPECT_LE(outcome.file.report.inducing->n_variables, 400);
+  return static_cast<int>(outcome.file.report.inducing->points->features.back().rows());
+}
+
+// No latent of the arm can be its true friction, which many rows tell; the surface's can.
+TEST(InducingFit, ADiscrepancyOfWhichTheRowsTellMuchHasPointsOfItsOwn) {
+  EXPECT_GT(n_points_of_discrepancy("models/arm_on_moving_plane.toml"), 20);
+  EXPECT_EQ(n_points_of_discrepancy(surface), 0);
+}
+
 std::vector<int> distrusted_states(int n, const std::vector<int>& wrong, double inducing, int max_iterations) {
   test::LogData log = test::drawn_log(surface, n, 4);
   for (const int i : wrong) log.accelerations(1, i) += 30;

@@ -155,6 +155,11 @@ TEST(FarValues, AreThoseFarBeyondAllOthers) {
   values[7] = std::nan("");
   values[250] = 1e6;
   EXPECT_THAT(far_values(values), testing::ElementsAre(250));
+  EXPECT_THAT(far_values_text("u", {values}).value(), testing::HasSubstr(": 1e+06 at row 251. "));
+  // of values that are some of a log's, in another order
+  std::vector<int> lines(300);
+  for (int k = 0; k < 300; ++k) lines[static_cast<std::size_t>(k)] = 2 + 3 * (299 - k);
+  EXPECT_THAT(far_values_text("u", {values}, {lines}).value(), testing::HasSubstr(": 1e+06 at row 148. "));
   RowVectorXd pulses = RowVectorXd::Zero(300);
   pulses[12] = 50;
   EXPECT_THAT(far_values(pulses), IsEmpty()) << "an input that rests but for a pulse";

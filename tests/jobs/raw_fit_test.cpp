@@ -1,5 +1,7 @@
 #include "gp2/jobs/raw_fit.hpp"
 
+#include <algorithm>
+#include <cmath>
 #include <functional>
 
 #include <gmock/gmock.h>
@@ -221,6 +223,112 @@ TEST(LearnAndSmooth, LearnsFromRowsWhereWindowsDoNotSayWhatIsAsked) {
     const LearnedLog log = learn_and_smooth(asked, noisy_log().table, {.most_passes = 0});
     EXPECT_EQ(log.windows, nullptr);
     EXPECT_THAT(log.rows, testing::SizeIs(50));
+  }
+}
+
+/// A slider whose position is logged, 100 times a second, and `more` columns by the time.
+CsvTable slider_log(const std::string& name,
+                    const std::vector<std::pair<std::string, std::function<double(double)>>>& more = {}) {
+  RandomStream random(1);
+  std::vector<CsvTable::Column> columns = {{"t", {}}, {name, {}}};
+  for (const auto& one : more) columns.push_back({one.first, {}});
+  for (int i = 0; i < 600; ++i) {
+    const double t = i / 100.0;
+    columns[0].numbers.push_back(t);
+    columns[1].numbers.push_back(0.5 * std::sin(2 * t) + 1e-3 * random.normal());
+    for (std::size_t k = 0; k < more.size(); ++k) columns[k + 2].numbers.push_back(more[k].second(t));
+  }
+  return CsvTable::from_columns("log", std::move(columns));
+}
+
+FitRequest request_of_slider(const std::string& constraints = "") {
+  FitRequest asked;
+  asked.model = Model::parse("coordinates = ['x']\n[mechanics]\nmass = [[1]]\n" + constraints +
+                                 "[[latent]]\nfeatures = ['x', 'dx']\ndirections = 'force'\n",
+                             "slider");
+  return asked;
+}
+
+TEST(LearnAndSmooth, LearnsFromRowsWhereVelocitiesAreLoggedUnderAnotherName) {
+  const auto velocity = [](double t) { return std::cos(2 * t); };
+  FitRequest asked = request_of_slider();
+  EXPECT_NE(learn_and_smooth(asked, slider_log("x"), {.most_passes = 0}).windows, nullptr);
+  EXPECT_EQ(learn_and_smooth(asked, slider_log("x", {{"dx", velocity}}), {.most_passes = 0}).windows, nullptr);
+  asked.problem.columns = {{"x", "s"}};
+  EXPECT_EQ(learn_and_smooth(asked, slider_log("s", {{"ds", velocity}}), {.most_passes = 0}).windows, nullptr);
+}
+
+// of which no acceleration says anything
+TEST(LearnAndSmooth, TakesAMotionThatConstraintsPrescribe) {
+  const FitRequest asked = request_of_slider("[constraints]\nposition = ['x - 0.5*sin(2*t)']\n");
+  const LearnedLog learned = learn_and_smooth(asked, slider_log("x"), {.most_passes = 0});
+  EXPECT_THAT(learned.data.independent, testing::IsEmpty());
+}
+
+// of so many a posterior keeps every other one
+TEST(LearnAndSmooth, LearnsFromManyRowsThroughInducingPoints) {
+  FitRequest asked = request_of_slider();
+  asked.problem.max_points = 5200;
+  asked.restarts = asked.max_iterations = 1;
+  asked.max_escapes = 0;
+  asked.inducing = 8;
+  std::vector<CsvTable::Column> columns = {{"t", {}}, {"x", {}}};
+  RandomStream random(1);
+  for (int i = 0; i < 5400; ++i) {
+    columns[0].numbers.push_back(i / 200.0);
+    columns[1].numbers.push_back(0.5 * std::sin(0.01 * i) + 1e-3 * random.normal());
+  }
+  const LearnedLog learned =
+      learn_and_smooth(asked, CsvTable::from_columns("log", std::move(columns)), {.most_passes = 1, .windows = false});
+  EXPECT_THAT(learned.rows, testing::SizeIs(5200));
+}
+
+TEST(LearnAndSmooth, FindsHyperparametersOfWindowsFromAllOfThem) {
+  FitRequest asked = request_of_slider();
+  const LearnedLog learned = learn_and_smooth(asked, slider_log("x"), {.most_passes = 0});
+  ASSERT_NE(learned.windows, nullptr);
+  asked.train_on = 50;
+  EXPECT_EQ(input_error_of([&] { prepare_fit(learned.request(asked, "log")); }),
+            "`train_on` is not for windows of a raw log: `windows=none` learns from its rows");
+}
+
+// A slow motion tells a stiffness by its positions, not by its accelerations. They bound the standard error (Cramér and Rao).
+TEST(LearnAndSmooth, IsNotSurerOfASpringThanPositionsAllow) {
+  constexpr double k = 40, noise = 1e-3, slow = 1.5, fast = 3.1;
+  FitRequest asked;
+  asked.model = Model::parse(
+      "coordinates = ['x']\ninputs = ['u']\n[parameters]\nk = { value = 30, bounds = [5, 100], estimate = true }\n"
+      "[mechanics]\nmass = [[1]]\nforce = ['u - k*x']\n[[latent]]\nfeatures = ['dx']\ndirections = 'force'\n",
+      "spring");
+  asked.problem.mean = Prior::Mean::force;
+  asked.problem.max_points = 200;
+  asked.hyperparameters = HyperparameterChoice::optimise;
+  asked.restarts = 1;
+  asked.max_escapes = 0;
+  RandomStream random(1);
+  std::vector<CsvTable::Column> columns = {{"t", {}}, {"x", {}}, {"u", {}}};
+  double information = 0;
+  for (int i = 0; i < 800; ++i) {
+    const double t = i / 100.0, one = 0.1 * std::sin(slow * t), other = 0.05 * std::sin(fast * t);
+    columns[0].numbers.push_back(t);
+    columns[1].numbers.push_back(one + other + noise * random.normal());
+    columns[2].numbers.push_back((k - slow * slow) * one + (k - fast * fast) * other);
+    information += std::pow((one / (k - slow * slow) + other / (k - fast * fast)) / noise, 2);
+  }
+  const LearnedLog learned = learn_and_smooth(asked, CsvTable::from_columns("log", std::move(columns)), {.most_passes = 0});
+  ASSERT_NE(learned.windows, nullptr);
+  const FitReport report = run_fit(prepare_fit(learned.request(asked, "log"))).file.report;
+  const auto found = std::ranges::find(report.hyperparameters, "k", &Hyperparameter::name);
+  ASSERT_NE(found, report.hyperparameters.end());
+  const double unit = found->positive ? found->value : 1;
+  const double stddev = unit * report.uncertainty.value().stddev[found - report.hyperparameters.begin()];
+  EXPECT_GT(stddev, 0.9 / std::sqrt(information));
+  EXPECT_LT(stddev, 2 / std::sqrt(information));
+  EXPECT_LT(std::abs(found->value - k), 3 * stddev);
+  for (const Hyperparameter& one : report.hyperparameters) {
+    if (one.kind == Hyperparameter::Kind::noise_stddev) {
+      EXPECT_NEAR(one.value, 1, 0.3) << "times the noise of the positions";
+    }
   }
 }
 

@@ -224,6 +224,9 @@ TEST(Resample, SaysWhatItCannotDo) {
   EXPECT_EQ(refused(choose(4, {"a"})), "log.csv: has 3 rows, fewer than the n = 4 asked for");
   EXPECT_THAT(refused(choose(1, {"x", "q7"})), HasSubstr("`features`: 'q7': "));
   EXPECT_THAT(refused(choose(1, {"dx"})), HasSubstr("log.csv: missing column 'dx'"));
+  EXPECT_EQ(refused(choose(1, {"l"})), "`features`: 'l': is the same at every state, and measures nothing");
+  EXPECT_EQ(refused(choose(1, {"ddx"})),
+            "`features`: 'ddx': reads ddx, which is no part of the state: measure by coordinates, velocities, t and inputs");
   const CsvTable words = CsvTable::parse("x,a\n0,0\nfar,1\n", "log.csv");
   EXPECT_EQ(input_error_of([&] { resample(model(), words, choose(1)); }), "log.csv:3: column 'x': 'far' is not a finite number");
 }

@@ -1,4 +1,6 @@
 // Data that deny the model are not believed without a word, and data that do not are.
+#include <map>
+
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
@@ -220,7 +222,7 @@ TEST(Residuals, OfARowThatStandsAloneHaveNoScale) {
   request.logs = {{data.table()}};
   request.max_iterations = 0;
   const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
-  EXPECT_THAT(outcome.cross_validation->text(), testing::StartsWith("left out one by one: 95 % coverage "));
+  EXPECT_THAT(outcome.cross_validation->text(), testing::StartsWith("left out row by row: 95 % coverage "));
 }
 
 TEST(Residuals, OfALongLogAreAskedOfAStretchFirst) {
@@ -321,6 +323,78 @@ w  = [-3, 3]
   }
   [[nodiscard]] Eigen::Index row_of(int input) const { return model.system->layout().u(input); }
 };
+
+// The force of the constraint beside accelerations of the same states, with a noise of 0.1.
+struct WithForces {
+  Driven driven;
+  MatrixXd states;
+  VectorXd ddz, lambda, noise = VectorXd(60);
+
+  // friction along the track alone, which the latent can be
+  WithForces() {
+    std::string text = driven.model.text;
+    for (const char* const part : {" - 0.2*dx*abs(dx)", " - 0.2*dy*abs(dy)"})
+      text.erase(text.find(part), std::string(part).size());
+    driven.model = Model::parse(text, "driven.toml");
+    GeneratedData drawn = generate(driven.model, GenerateOptions{60, 41, VectorXd::Zero(3)});
+    RandomStream random(41, 1);
+    for (double& one : noise) one = random.normal();
+    ddz = drawn.accelerations.row(2).transpose();
+    const VectorXd dz = drawn.states.row(driven.model.system->layout().dq(2)).transpose();
+    lambda = ddz.array() + 9.81 + 0.5 * dz.array() + 0.1 * noise.array();
+    states = std::move(drawn.states);
+  }
+  [[nodiscard]] FitOutcome fit(const VectorXd& forces, bool has_accelerations = true) const {
+    FitRequest request;
+    request.model = driven.model;
+    if (has_accelerations) request.logs = {{driven.data(41).table()}};
+    request.problem.mean = Prior::Mean::force;
+    request.problem.also_noise_stddev = 0.1;
+    SideInformation measured;
+    measured.quantity = View::Quantity::multipliers;
+    std::vector<CsvTable::Column> columns;
+    const std::vector<std::string> names = driven.model.system->state_names();
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      const auto row = states.row(static_cast<Eigen::Index>(k));
+      if (!row.hasNaN()) columns.push_back({names[k], {row.begin(), row.end()}});
+    }
+    columns.push_back({"lambda1", {forces.begin(), forces.end()}});
+    measured.log.table = CsvTable::from_columns("forces.csv", std::move(columns));
+    request.also = {measured};
+    request.restarts = 1;
+    request.max_iterations = 60;
+    return run_fit(prepare_fit(std::move(request)));
+  }
+};
+
+TEST(Residuals, OfForcesAreJudgedAsThoseOfAccelerations) {
+  const WithForces p;
+  const auto of_forces = testing::AllOf(testing::StartsWith("warning: "), HasSubstr("lambda1"));
+  const FitOutcome sound = p.fit(p.lambda);
+  EXPECT_THAT(sound.notes, Not(Contains(HasSubstr("lambda1"))));
+  EXPECT_THAT(sound.cross_validation->text(),
+              testing::ContainsRegex("row by row: nrmse .*; multipliers: nrmse .*95 % coverage "));
+  ASSERT_EQ(sound.cross_validation->other_views.size(), 1U);
+  EXPECT_NEAR(sound.cross_validation->other_views.front().one_by_one.coverage95, 0.95, 0.06);
+  VectorXd spikes = p.lambda;
+  for (const int i : {7, 30, 51}) spikes[i] += 8;
+  const std::map<std::string, VectorXd> faults = {{"sign", -p.lambda},
+                                                  {"kN", 1e-3 * p.lambda},
+                                                  {"20 times the noise", p.lambda + 1.9 * p.noise},
+                                                  {"spikes", spikes},
+                                                  {"shuffled", p.lambda.reverse()},
+                                                  {"without m ddz", p.lambda - p.ddz},
+                                                  {"offset", p.lambda.array() + 5}};
+  for (const auto& [fault, forces] : faults) EXPECT_THAT(p.fit(forces).notes, Contains(of_forces)) << fault;
+}
+
+TEST(Residuals, OfForcesAloneHaveFigures) {
+  const WithForces p;
+  const FitOutcome outcome = p.fit(p.lambda, false);
+  EXPECT_THAT(outcome.cross_validation->text(), testing::StartsWith("left out row by row: multipliers: nrmse "));
+  EXPECT_THAT(outcome.cross_validation->text(), Not(HasSubstr("nan")));
+  EXPECT_LT(outcome.cross_validation->one_by_one.nrmse, 0.5);
+}
 
 TEST(Residuals, TellOfAnInputThatActsOtherwiseThanLogged) {
   const Driven driven;

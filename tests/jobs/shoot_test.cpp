@@ -22,8 +22,11 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using testing::Contains;
+using testing::Each;
 using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::Not;
 
 /// A bob on a rod, in the plane: a constraint, a drive, friction to be learned, and a mass and a length that are not known.
 Model swing(const std::string& mass, const std::string& load) {
@@ -92,8 +95,21 @@ CsvTable motion(double noise_stddev, std::uint64_t seed, Index n = 1500) {
   return CsvTable::from_columns("motion.csv", std::move(columns));
 }
 
+/// A log of which one column is wrong.
+CsvTable with_column_off(const CsvTable& log, const std::string& name, double factor, double offset) {
+  std::vector<CsvTable::Column> columns;
+  for (int c = 0; c < static_cast<int>(log.header().size()); ++c) {
+    const std::string& here = log.header()[static_cast<std::size_t>(c)];
+    std::vector<double> values;
+    for (int i = 0; i < log.n_rows(); ++i) values.push_back(here == name ? factor * log.number(i, c) + offset : log.number(i, c));
+    columns.push_back({here, std::move(values)});
+  }
+  return CsvTable::from_columns("wrong.csv", std::move(columns));
+}
+
 /// A fit to some rows, in which θ is then put off by a share.
-FitFile fit_of(double off, std::uint64_t seed = 1) {
+/// @param inducing  variables that it goes through
+FitFile fit_of(double off, std::uint64_t seed = 1, std::optional<double> inducing = {}) {
   FitRequest request;
   request.model =
       swing("{ value = 0.25, estimate = true, bounds = [0.05, 2] }", "{ value = 0.08, estimate = true, bounds = [0.005, 1] }");
@@ -101,6 +117,7 @@ FitFile fit_of(double off, std::uint64_t seed = 1) {
   request.problem.observe = {"ddq"};
   request.problem.mean = Prior::Mean::force;
   request.problem.max_points = 150;
+  request.inducing = inducing;
   request.hyperparameters = HyperparameterChoice::optimise;
   request.thin = false;
   FitFile file = run_fit(prepare_fit(std::move(request))).file;
@@ -128,6 +145,17 @@ TEST(Shoot, FindsParametersFromWhichTheMotionComes) {
   EXPECT_FALSE(shot.report.draws.has_value());
 }
 
+TEST(Shoot, WhatIsWrittenOfAFitThroughInducingPointsStandsForTheNewParameters) {
+  const FitFile fit = fit_of(0.2, 1, 30);
+  ASSERT_TRUE(fit.report.inducing && fit.report.inducing->summary);
+  const ShootOutcome out = shoot(fit, motion(0, 1, 400), {.duration = 0.8});
+  const Posterior written = out.fit.posterior(), learned = Posterior(fit.prior(), fit.observations, written.values());
+  const View view = View::constrained_acceleration(*fit.model.system);
+  const MatrixXd states = fit.observations[0].states(), mean = learned.mean(view, states);
+  EXPECT_LT((written.mean(view, states) - mean).norm(), 1e-9 * mean.norm());
+  EXPECT_NEAR(out.fit.report.negative_log_likelihood, learned.negative_log_likelihood(), 1e-6);
+}
+
 TEST(Shoot, DeviationsHoldTheErrors) {
   int held = 0;
   constexpr int n_seeds = 5;
@@ -139,8 +167,30 @@ TEST(Shoot, DeviationsHoldTheErrors) {
       held += std::abs(one.value - truths[k]) < 2 * one.stddev ? 1 : 0;
     }
     EXPECT_LT(out.rms_after[0], 1.5 * 2e-3);
+    EXPECT_THAT(out.notes, Each(Not(HasSubstr("warning: the motion")))) << seed;
   }
   EXPECT_GE(held, 8) << "of 10";
+}
+
+TEST(Shoot, DoubtsALogThatContradictsTheFit) {
+  const FitFile fit = fit_of(0);
+  const CsvTable log = motion(2e-3, 1);
+  EXPECT_THAT(shoot(fit, with_column_off(log, "u", 1.3, 0), {.duration = 1}).notes,
+              Contains(HasSubstr("warning: the motion tells other values than the accelerations did: m, ")));
+  EXPECT_THAT(shoot(fit, with_column_off(log, "q", 1, 0.1), {.duration = 1}).notes,
+              Contains(HasSubstr("warning: the motion stays farther off than errors of the log and of the latents let it: q, ")));
+}
+
+TEST(Shoot, FewStretchesTellNoErrors) {
+  const FitFile fit = fit_of(0);
+  const CsvTable log = motion(1e-3, 2, 400);
+  const auto told = Contains(HasSubstr("warning: no standard errors: they come from how 4 stretches or more differ"));
+  const ShootOutcome few = shoot(fit, log, {.duration = 0.8, .most_stretches = 3});
+  EXPECT_THAT(few.notes, told);
+  for (const ShotParameter& one : few.parameters) EXPECT_TRUE(std::isnan(one.stddev)) << one.name;
+  const ShootOutcome enough = shoot(fit, log, {.duration = 0.8, .most_stretches = 4});
+  EXPECT_THAT(enough.notes, Not(told));
+  for (const ShotParameter& one : enough.parameters) EXPECT_GT(one.stddev, 0) << one.name;
 }
 
 TEST(Shoot, SameBitsForAnyNumberOfThreads) {
@@ -164,6 +214,7 @@ TEST(Shoot, StretchesEndWhereTheLogDoes) {
   }
   EXPECT_EQ(shoot(fit, log.take(rows), {.duration = 1.5}).n_stretches, 2);
   EXPECT_EQ(shoot(fit, log, {.duration = 1.9}).n_stretches, 2);
+  EXPECT_EQ(shoot(fit, motion(1e-3, 2, 401), {.duration = 2}).n_stretches, 2) << "one ends where the next starts";
   EXPECT_EQ(shoot(fit, log, {.duration = 0.4, .most_stretches = 3}).n_stretches, 3);
   EXPECT_THAT(input_error_of([&] { shoot(fit, log.take(rows), {.duration = 1.9}); }),
               HasSubstr("motion.csv: no stretch of 1.9 s with at least 8 rows without a break; rows are 0.01 s apart"));

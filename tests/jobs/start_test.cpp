@@ -6,6 +6,7 @@
 #include <gmock/gmock.h>
 
 #include "gp2/jobs/simulate_job.hpp"
+#include "input_error.hpp"
 
 namespace gp2 {
 namespace {
@@ -188,6 +189,14 @@ TEST(StartOfALog, WarnsOfAWholeStartThatContradictsTheConstraints) {
       }
     }
   }
+}
+
+TEST(StartOfALog, IsMoreThanATime) {
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.1);
+  request.start = CsvTable::parse("t,u\n0,1\n1,2\n", "inputs.csv");
+  EXPECT_EQ(test::input_error_of([&] { prepare_simulation(wire_pendulum(""), request); }),
+            "`start`: inputs.csv has none of the columns x, y, a, dx, dy, da");
 }
 
 // y is open, x and a are given too many

@@ -96,22 +96,28 @@ TEST(UpdateJob, AWindowLetsTheFirstRowsGoWhereHyperparametersAreIntegrated) {
 TEST(UpdateJob, SaysWhatTheFitIsSureIsOtherwise) {
   const FitFile fit = fit_of(log_of(60, 1));
   const CsvTable sound = log_of(40, 2);
-  const auto notes_under = [&](const std::string& column, double factor) {
+  const auto notes_under = [&](const std::string& column, double factor, double added = 0) {
     std::vector<CsvTable::Column> columns;
     for (const std::string& name : sound.header()) {
       columns.push_back({name, {}});
       for (int row = 0; row < sound.n_rows(); ++row) {
-        columns.back().numbers.push_back((name == column ? factor : 1) * sound.number_or_empty(row, sound.find(name)));
+        const double value = sound.number_or_empty(row, sound.find(name));
+        columns.back().numbers.push_back(name == column ? factor * value + added : value);
       }
     }
     return update(fit, {CsvTable::from_columns("next", std::move(columns))}, {}).notes;
   };
-  EXPECT_THAT(notes_under("", 1), testing::Not(Contains(HasSubstr("deviations from what it predicts"))));
+  EXPECT_THAT(notes_under("", 1), testing::Not(Contains(HasSubstr("deviations let them"))));
   for (const auto& [column, factor] : {std::pair("ddq1", -1.0), std::pair("ddq2", 1000.0), std::pair("ddq1", 0.0)}) {
     EXPECT_THAT(notes_under(column, factor),
-                Contains(HasSubstr(fmt::format("of {} near the fit's data lie more than six deviations", column))))
+                Contains(AllOf(HasSubstr("farther from what it predicts than its deviations let them: "),
+                               HasSubstr(fmt::format("{} (mean ", column)), HasSubstr("`window` or `forget`"))))
         << column;
   }
+  // an offset of a few deviations, which no single value tells
+  EXPECT_THAT(notes_under("", 1), testing::Not(Contains(HasSubstr("A ddq = b"))));
+  EXPECT_THAT(notes_under("ddq3", 1, 1.0), Contains(HasSubstr("warning: next: measured ddq on A ddq = b")));
+  EXPECT_THAT(notes_under("ddq3", 1, 1.0), Contains(HasSubstr("ddq3 (mean ")));
 }
 
 // One value, or a log of few rows, is enough where no noise makes it.

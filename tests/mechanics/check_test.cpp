@@ -1,6 +1,7 @@
 #include "gp2/mechanics/check.hpp"
 
 #include <cmath>
+#include <random>
 
 #include <gmock/gmock.h>
 
@@ -59,6 +60,40 @@ TEST(Check, ConstraintsThatLeaveNoFreedomAreWarnedOf) {
   EXPECT_EQ(said(""), "");
   EXPECT_THAT(said("[constraints]\nacceleration = ['ddx - 1', 'ddz - x*ddx']"), HasSubstr("they leave no freedom"));
   EXPECT_EQ(said("[constraints]\nacceleration = ['ddz - x*ddx']"), "");
+}
+
+TEST(Check, AMotionThatConstraintsSayAllOfHasNoColumnsToObserve) {
+  const Model model = Model::parse(
+      "coordinates = ['x', 'z']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n"
+      "[constraints]\nposition = ['x - 0.3*sin(t)', 'z - 0.2*cos(t)']\n",
+      "two");
+  MatrixXd states(5, 8), accelerations(2, 8);
+  for (Eigen::Index i = 0; i < 8; ++i) {
+    const double t = 0.1 * static_cast<double>(i), s = std::sin(t), c = std::cos(t);
+    states.col(i) << 0.3 * s, 0.2 * c, 0.3 * c, -0.2 * s, t;
+    accelerations.col(i) << -0.3 * s, -0.2 * c;
+  }
+  EXPECT_EQ(dependent_columns(*model.system, states, Eigen::VectorXd(), accelerations), std::nullopt);
+}
+
+TEST(Check, DerivativesInAParameterAreHeldAgainstDifferencesOfItsOwnSize) {
+  const auto found = [](const std::string& parameters, const std::string& force) {
+    const Model model = Model::parse("coordinates = ['x', 'z']\n[parameters]\n" + parameters +
+                                         "\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\nforce = ['" + force + "', '0']\n",
+                                     "two");
+    for (Finding& finding : check_system(*model.system, bead_states(), model.system->parameter_values())) {
+      if (finding.text.starts_with("derivatives of M, A, b, F")) return finding;
+    }
+    return Finding{Finding::Level::error, "not looked at"};
+  };
+  // 5 nm over which a force changes by e
+  EXPECT_EQ(found("l = 5e-9", "exp(-1e-8*x/l)").level, Finding::Level::good);
+  const Finding at_zero = found("c = 0", "-sqrt(c)*(1 + dx^2)");
+  EXPECT_EQ(at_zero.level, Finding::Level::warning);
+  EXPECT_EQ(
+      at_zero.text,
+      "derivatives of M, A, b, F in the parameters: that in 'c' is not finite where they are: it cannot be estimated from its "
+      "value 0");
 }
 
 TEST(Check, CoriolisForcesThatAreMissingAreFoundBesideFriction) {
@@ -146,6 +181,48 @@ position = ["z - a*x^2"]
   for (const int n_threads : {1, 2}) {
     EXPECT_THAT(all_of(check_system(*model.system, states, parameters, n_threads)), HasSubstr("x is nan at state 701\n"));
   }
+}
+
+// A hoist: two loads on one drum, whose rates of change are logged by one sensor.
+TEST(Check, AccelerationsMayDependOnEachOtherInPart) {
+  const Model model = Model::parse(R"(
+coordinates = ["th", "y1", "y2"]
+[mechanics]
+mass = [["0.02", "0", "0"], ["0", "1.2", "0"], ["0", "0", "0.9"]]
+[constraints]
+position = ["y1 - 0.1*th", "y2 + 0.1*th"]
+)",
+                                   "hoist");
+  constexpr int n = 40;
+  const Eigen::Vector3d noise(0.5, 0.05, 0.05);
+  const MatrixXd stddev = noise.replicate(1, n), states = MatrixXd::Zero(7, n);
+  std::mt19937 random(7);
+  std::normal_distribution<double> normal;
+  MatrixXd ddq(3, n);
+  for (Eigen::Index i = 0; i < n; ++i) {
+    const double th = 20 * normal(random);
+    ddq.col(i) << th + noise[0] * normal(random), 0.1 * th + noise[1] * normal(random), -0.1 * th + noise[2] * normal(random);
+  }
+  const auto found = [&](const MatrixXd& of_noise) {
+    return dependent_columns(*model.system, states, Eigen::VectorXd(), ddq, of_noise);
+  };
+  EXPECT_EQ(found(stddev), std::nullopt);
+  EXPECT_EQ(found(MatrixXd()), std::nullopt);
+  const auto text = [&] { return all_of(check_data(*model.system, states, Eigen::VectorXd(), ddq, 5 * stddev)); };
+  EXPECT_THAT(text(), HasSubstr("the noise is stated too large, or these columns share their errors"));
+
+  ddq.row(2) = -ddq.row(1);
+  for (const MatrixXd& of_noise : {MatrixXd(), stddev}) {
+    const auto rows = found(of_noise);
+    ASSERT_TRUE(rows);
+    EXPECT_THAT(*rows, testing::AnyOf(testing::ElementsAre(0, 1), testing::ElementsAre(0, 2)));
+  }
+  EXPECT_THAT(text(), HasSubstr("so only 2 of them are independent measurements"));
+  EXPECT_THAT(text(), testing::Not(HasSubstr("stated too large")));
+
+  ddq.row(2) = ddq.row(2).unaryExpr([](double one) { return 1e-3 * std::round(1e3 * one); });
+  EXPECT_TRUE(found(stddev)) << "rounding is far below the noise";
+  EXPECT_FALSE(found(MatrixXd())) << "it may be the noise";
 }
 
 TEST(Check, WhatIsRoundingIsJudgedOverAllRows) {

@@ -5,6 +5,8 @@
 #include <Eigen/Dense>
 
 #include "gp2/error.hpp"
+#include "gp2/prior/latent_spec.hpp"
+#include "input_error.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -206,6 +208,40 @@ TEST(PriorTest, AnotherBaseIsRefusedForAModelOfSeveralLatents) {
   PriorOptions options;
   options.base = Latent::Base::force;
   EXPECT_THROW(make_prior(friction_model(), options), InputError);
+}
+
+TEST(PriorTest, FeaturesFromCodeOfAnotherShapeAreRefusedAlsoWhereTheyAreCentred) {
+  const Model& model = test::model("models/duffing.toml");
+  LatentSpec spec{.name = "code", .features = {"a"}};
+  spec.feature_code.evaluate = [](const auto& states, const auto&) -> MatrixXd { return MatrixXd::Ones(500, states.cols()); };
+  PriorOptions options;
+  options.feature_centres = {{"a", 2.0}};
+  const Prior prior = make_prior(model.system, {spec}, options);
+  EXPECT_THAT(test::input_error_of([&] { evaluate_features(prior, 0, states_of(model)); }),
+              testing::HasSubstr("returned the shape 500 × "));
+}
+
+TEST(PriorTest, AnotherBaseLeavesNothingOfDirectionsNorOfTheSignAlongThem) {
+  const Model damped = Model::parse(R"toml(
+name        = "damped"
+coordinates = ["x", "y"]
+[mechanics]
+mass = [["1", "0"], ["0", "2"]]
+[[latent]]
+kernel     = "se"
+features   = ["dx", "dy"]
+directions = { force = [["-dx"], ["-dy"]] }
+positive   = true
+)toml",
+                                    "damped");
+  EXPECT_TRUE(make_prior(damped).latents[0].is_positive);
+  PriorOptions options;
+  for (const Latent::Base base : {Latent::Base::acceleration, Latent::Base::force}) {
+    options.base = base;
+    const Prior prior = make_prior(damped, options);
+    EXPECT_FALSE(prior.latents[0].is_positive) << "accelerations of either sign";
+    EXPECT_FALSE(prior.is_nonlinear());
+  }
 }
 
 TEST(PriorTest, ColumnsAreNamedAfterWhatTheyActOn) {

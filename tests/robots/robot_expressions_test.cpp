@@ -517,6 +517,18 @@ TEST(RobotExpressions, OfALongChainTakeDifferencesInTheState) {
   EXPECT_GT(evaluator->derivatives().size(), 1000U);
 }
 
+TEST(RobotExpressions, NamesOfBodiesAndJointsMayHaveSpaces) {
+  const std::string legs = R"(<mujoco><worldbody><body name="left leg"><joint name="left knee" axis="0 1 0" damping="0.2"/>
+    <inertial pos="0 0 -0.2" mass="1.5" diaginertia="0.01 0.01 0.002"/></body></worldbody></mujoco>)";
+  const Model model = model_of(written(legs, "legs.xml"), R"toml(
+coordinates = ["q"]
+[parameters]
+m = { of = "mass( 'left leg' )", value = 1.7 }
+d = { of = 'damping("left knee")' }
+)toml");
+  EXPECT_EQ(model.system->parameter_values(), Eigen::Vector2d(1.7, 0.2));
+}
+
 TEST(RobotModel, SaysWhatIsWrong) {
   const std::string arm = fmt::format("robot = '{}'\n", source_path("experiments/arm_on_surface/iiwa7.xml").string());
   const auto message = [&](const std::string& more) {

@@ -292,6 +292,26 @@ position = [{ expr = "z + 0.99995", contact = "touch", restitution = 1 }]
   EXPECT_NEAR(motion.events[0].time, std::acos(-0.99995), 1e-2);
 }
 
+// What rests has no error, however long a step is: the forces of time that let it go are looked for all the same.
+TEST(Contact, AtRestIsLetGoEachTimeThatItsLoadIsLifted) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1.3"]]
+force = ["-1.3*9.81 + 16*sin(1.7*t)"]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+)toml",
+                                   "at rest");
+  const double first = std::asin(1.3 * g / 16) / 1.7, period = 2 * std::numbers::pi / 1.7;
+  const std::vector<ContactEvent> released = of_kind(motion_of(model, {0, 0}, 37, 2), Kind::released);
+  ASSERT_EQ(released.size(), 10U);
+  for (std::size_t k = 0; k < released.size(); ++k) {
+    EXPECT_NEAR(released[k].time, first + static_cast<double>(k) * period, of_event) << k;
+  }
+}
+
 TEST(Contact, HoldsForAnHour) {
   // driven to and fro over hills that are too flat to leave
   const Model model = Model::parse(R"toml(
@@ -788,6 +808,9 @@ TEST(Contact, OfAnotherFormIsRefused) {
   EXPECT_THAT(message(R"({ expr = "z", contact = "touch" }, { expr = "2 - z", contact = "touch" })"),
               HasSubstr("is another contact's input"));
   EXPECT_THAT(message(R"({ expr = "z", contact = "touch" })", "position", R"({ name = "touch", delay = 0.1 })"),
+              HasSubstr("neither a delay nor a lag"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "touch" })", "position",
+                      R"({ name = "touch", lag = { value = 0, bounds = [0, 0.1], estimate = true } })"),
               HasSubstr("neither a delay nor a lag"));
 }
 

@@ -345,5 +345,40 @@ TEST(GenerateGrid, ThatIsNoneIsRefused) {
   EXPECT_EQ(refused({{"x", 2000000000}, {"dx", 2000000000}}), "grid: 4e+18 points are more than 1e+07");
 }
 
+// ---- rules of [motion]
+
+Model driven(const std::string& inputs, const std::string& more) {
+  return Model::parse("coordinates = [\"x\"]\ninputs = " + inputs +
+                          "\n[mechanics]\nmass = [[1]]\nforce = [\"u\"]\n[motion]\nrate = 50\nsegment = [1, 2]\n"
+                          "natural_frequency = 5\ntargets = { x = [-1, 1] }\n" +
+                          more,
+                      "driven.toml");
+}
+
+TEST(GenerateMotion, ABodyThatDryFrictionHoldsIsAtRest) {
+  const GeneratedData data = noise_free(driven("[\"u\"]", "[truth]\nforce = [\"-2*sign(dx)\"]\n"), 100);
+  int n_held = 0;
+  for (Eigen::Index i = 0; i < 100; ++i) {
+    const double v = data.states(1, i), force = data.states(3, i);
+    if (std::abs(v) > 1e-9) {
+      EXPECT_NEAR(data.accelerations(0, i), force - (v > 0 ? 2 : -2), 1e-9) << i;
+    } else if (std::abs(force) < 2) {
+      EXPECT_NEAR(data.accelerations(0, i), 0, 1e-9) << i;
+      ++n_held;
+    }
+  }
+  EXPECT_GT(n_held, 2);
+  EXPECT_LT(n_held, 98);
+}
+
+TEST(GenerateMotion, DoesNotDriveThroughContacts) {
+  EXPECT_EQ(
+      error_of(driven("[\"u\", \"touch\"]",
+                      "[constraints]\nposition = [{ expr = \"x + 0.5\", contact = \"touch\" }]\n"
+                      "[truth]\nforce = [0]\n")),
+      "driven.toml: [motion] looks for no contact, so that a body would pass through its surface: draw states by [sampling], "
+      "or simulate a motion");
+}
+
 }  // namespace
 }  // namespace gp2

@@ -290,6 +290,8 @@ TEST(SimulateDryFriction, IsFoundInForcesTruthAndLatents) {
                           "-dy*(dx^2 + 1e-6)^(-1/2) + (dx^2 + dy^2)^(-1/2)/sqrt(dx^2 + x^2) + sqrt(dx^2 + dy^2)"});
   EXPECT_EQ(switching_functions(lengths, false).names(),
             (std::vector<std::string>{"dx", "2*dy, x*(dx - dy)/1.7320508075688772", "dx, dy"}));
+  // what two bodies do to each other, written as each of them sees it
+  EXPECT_EQ(switching_functions(bodies({"x", "y"}, {"-sign(dx - dy)", "-sign(dy - dx)"}), false).size(), 1);
 }
 
 // ---- dry friction in a plane

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numbers>
 
 #include <gtest/gtest.h>
 
@@ -110,6 +111,59 @@ TEST(WindowedAccelerations, HaveTheNoiseThatPositionsHave) {
     one.value = 0;
   }
   EXPECT_LE((L * L.transpose() - covariance).norm(), 1e-10 * covariance.norm());
+}
+
+MatrixXd covariance_of(const std::vector<WeightedSum>& sums) {
+  const Index n = std::ssize(sums);
+  MatrixXd L = MatrixXd::Zero(n, n);
+  for (Index r = 0; r < n; ++r) {
+    const VectorXd& noise = sums[static_cast<std::size_t>(r)].noise;
+    L.row(r).segment(r - noise.size() + 1, noise.size()) = noise.transpose();
+  }
+  return L * L.transpose();
+}
+
+// An oscillator's acceleration −ω²q − ωq̇/2 is asked for at states that are smoothed from the positions of the sums. The noise of each
+// position goes through both sides.
+TEST(WindowedAccelerations, CountWhatErrorsOfTheStatesMakeOfThem) {
+  const SmootherModel motion{.lengthscale = 0.5, .noise_stddev = 0.01, .time_stddev = 0};
+  const VectorXd times = VectorXd::LinSpaced(301, 0, 3);
+  const double bandwidth = bandwidth_of(motion, 0.01);
+  const VectorXd states = every(times, std::lround(0.25 / bandwidth / 0.01));
+  WindowGrid grid{-0.8 / bandwidth, 0.4 / bandwidth};
+  std::vector<Measurement> positions = positions_of(times, [](double) { return 0.0; });
+  const auto sums_of = [&] {
+    return windowed_accelerations(positions, motion, grid, up_to(static_cast<int>(3 / grid.spacing) + 2), states, 0, 0);
+  };
+  const MatrixXd of_exact_states = covariance_of(sums_of());
+  const Index n = of_exact_states.rows();
+  // what the noise of each position changes: the sums, and the positions and velocities that are summed over
+  MatrixXd measured(n, times.size()), position(n, times.size()), velocity(n, times.size());
+  for (Index k = 0; k < times.size(); ++k) {
+    positions[static_cast<std::size_t>(k)].value = motion.noise_stddev;
+    const Eigen::Matrix3Xd smoothed = smooth(motion, positions, states).mean;
+    const std::vector<WeightedSum> sums = sums_of();
+    positions[static_cast<std::size_t>(k)].value = 0;
+    for (Index r = 0; r < n; ++r) {
+      const WeightedSum& sum = sums[static_cast<std::size_t>(r)];
+      measured(r, k) = sum.value;
+      position(r, k) = smoothed.row(0).segment(sum.first, sum.weights.size()).dot(sum.weights);
+      velocity(r, k) = smoothed.row(1).segment(sum.first, sum.weights.size()).dot(sum.weights);
+    }
+  }
+  // what changes slowly, to which many windows add up
+  const VectorXd taper = Eigen::ArrayXd::LinSpaced(n, 0, std::numbers::pi).sin().square();
+  for (const double frequency : {0.1, 0.3}) {  // of the oscillator, in units of the bandwidth
+    const double w = 2 * std::numbers::pi * frequency * bandwidth;
+    const MatrixXd off = measured + w * w * position + 0.5 * w * velocity, expected = off * off.transpose();
+    const VectorXd ones = VectorXd::Ones(states.size());
+    grid.sensitivity = {states, -w * w * ones, -0.5 * w * ones};
+    const MatrixXd covariance = covariance_of(sums_of());
+    EXPECT_LT((covariance.diagonal() - expected.diagonal()).cwiseQuotient(expected.diagonal()).cwiseAbs().maxCoeff(), 0.04);
+    const auto slow = [&](const MatrixXd& of_sums) { return taper.dot(of_sums * taper); };
+    EXPECT_NEAR(slow(covariance) / slow(expected), 1, 0.05);
+    EXPECT_LT(slow(of_exact_states), 0.6 * slow(expected));
+  }
 }
 
 TEST(WindowedAccelerations, LeaveOutWindowsWithAPause) {

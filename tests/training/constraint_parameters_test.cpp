@@ -96,6 +96,45 @@ TEST(ConstraintParameters, AreFoundBesideOthersThatTheConstraintHas) {
   EXPECT_NEAR(found[1].value, 0.25, 0.05);
 }
 
+// A log without positions, which nothing else reads, says nothing of a distance between them.
+TEST(ConstraintParameters, AreAsWellKnownBesideALogThatCannotTell) {
+  const Model rod = Model::parse(R"toml(
+name        = "rod"
+coordinates = ["x", "y"]
+[parameters]
+l = { value = 0.5, bounds = [0.1, 1] }
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+[constraints]
+position = ["y - x - l"]
+[[latent]]
+kernel     = "se"
+features   = ["dx"]
+directions = "acceleration"
+)toml",
+                                 "rod");
+  constexpr int n = 30;
+  RandomStream random(6);
+  MatrixXd states = MatrixXd::Zero(rod.system->layout().size(), n), values(2, n);
+  for (int i = 0; i < n; ++i) {
+    const double x = random.normal(), dx = random.normal();
+    states.col(i).head(4) << x, x + 0.4 + 0.01 * random.normal(), dx, dx;
+    values.col(i).setConstant(random.normal());
+  }
+  const Observations with(states, View::constrained_acceleration(*rod.system), values, VectorXd::Constant(2, 0.05));
+  states.topRows(2).setConstant(std::numeric_limits<double>::quiet_NaN());
+  const Observations without(states, with.view(), values, VectorXd::Constant(2, 0.05));
+  const Prior prior = make_prior(rod);
+  const auto prior_of_l = [&](const std::vector<Observations>& observations) {
+    return default_hyperparameters(prior, observations, {"l"}, {}).back().hyperprior;
+  };
+  const HyperPrior alone = prior_of_l({with}), beside = prior_of_l({with, without, without});
+  EXPECT_NEAR(alone.median, 0.4, 0.01);
+  EXPECT_NEAR(alone.stddev, 0.01 / std::sqrt(n), 0.5 * 0.01 / std::sqrt(n));
+  EXPECT_NEAR(beside.median, alone.median, 1e-9);
+  EXPECT_NEAR(beside.stddev, alone.stddev, 1e-9);
+}
+
 TEST(ConstraintParameters, KeepTheirStartWhereNothingKnowsThem) {
   const Model model = bead("x^2 + y^2 - l^2");
   const std::vector<Found> found = fit_of(model, observe(model, 1e-3, 5), {"l", "p"});

@@ -276,7 +276,8 @@ TEST(HamiltonianTest, TheNumberOfDrawsIsChecked) {
 TEST(HamiltonianTest, LeftOutValuesAreWeighedByWhatTheyDoToEachDraw) {
   const DrawProblem p = make_problem(sloped_line(), 8, {});
   const Fit fitted = fit_of(p, drawing(4));
-  const LeaveOneOut left_out = leave_one_out(fitted.posterior).front();
+  const LeftOut all_left_out = leave_out(fitted.posterior, 0);
+  const LeaveOneOut &left_out = all_left_out.values.front(), &row = all_left_out.rows.front();
   const Observations& all = p.observations.front();
   const View view = View::constrained_acceleration(*p.prior.system);
   for (int i = 0; i < all.n_data(); ++i) {
@@ -294,9 +295,11 @@ TEST(HamiltonianTest, LeftOutValuesAreWeighedByWhatTheyDoToEachDraw) {
       weight[k] = std::sqrt(total) * std::exp(0.5 * error * error / total);
     }
     weight /= weight.sum();
-    EXPECT_NEAR(left_out.mean(0, i), weight.dot(mean), 1e-9);
     const VectorXd deviation = mean.array() - weight.dot(mean);
-    EXPECT_NEAR(left_out.variance(0, i), weight.dot(VectorXd(variance + deviation.cwiseAbs2())), 1e-9);
+    for (const LeaveOneOut* const one : {&left_out, &row}) {
+      EXPECT_NEAR(one->mean(0, i), weight.dot(mean), 1e-9);
+      EXPECT_NEAR(one->variance(0, i), weight.dot(VectorXd(variance + deviation.cwiseAbs2())), 1e-9);
+    }
   }
 }
 

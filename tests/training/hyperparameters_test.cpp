@@ -312,6 +312,20 @@ directions = "acceleration"
   EXPECT_EQ(find(all, "m").upper, 4.0) << "to twice the value";
 }
 
+// the last would count, but the optimiser would see the slope of both
+TEST(HyperparametersTest, ThatStandTwiceAreRefused) {
+  const Model& model = test::model("models/surface.toml");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe_drawn(model, 10, false);
+  std::vector<Hyperparameter> all = default_hyperparameters(prior, observations, {}, {});
+  const auto message = [&] { return test::input_error_of([&] { fit(prior, observations, all); }); };
+  for (const Hyperparameter& h : {all.front(), all.back()}) {
+    all.push_back(h);
+    EXPECT_EQ(message(), fmt::format("hyperparameter '{}' stands twice; leave out one", h.name));
+    all.pop_back();
+  }
+}
+
 TEST(HyperparametersTest, AParameterThatStandsInAFeatureCannotBeEstimated) {
   const Model& model = test::model("models/arm_on_moving_plane.toml");
   const Prior prior = make_prior(model);

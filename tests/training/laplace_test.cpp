@@ -155,6 +155,25 @@ TEST(LaplaceTest, ParametersThatEnterByTheirSumOnlyAreNamedUndetermined) {
   EXPECT_NEAR(uncertainty.undetermined(0, 0) / uncertainty.undetermined(1, 0), -2, 1e-4);
 }
 
+// Along p + 2 r = const the one reaches its bound first: the other is no better known for it.
+TEST(LaplaceTest, AParameterAtABoundByChanceIsNotHeld) {
+  std::string text = line().text;
+  text.replace(text.find("p*x + r"), 7, "p + 2*r");
+  LaplaceProblem p = only(laplace_problem(Model::parse(text, "sum"), 20, {"p", "r"}), {Kind::parameter});
+  FitOptions once;
+  once.n_restarts = once.n_threads = 1;
+  p.hyperparameters = fit(p.prior, p.observations, p.hyperparameters, once).report.hyperparameters;
+  Hyperparameter &at_bound = p.hyperparameters[0], &other = p.hyperparameters[1];
+  other.value += (at_bound.value - at_bound.lower) / 2;
+  at_bound.value = at_bound.lower;
+  const LaplaceUncertainty open = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
+  EXPECT_TRUE(std::isinf(open.stddev[0]));
+  EXPECT_TRUE(std::isinf(open.stddev[1]));
+  // where the data push it there it is
+  other.value += 0.5;
+  EXPECT_EQ(laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1).held, std::vector<int>{0});
+}
+
 // A direction of no curvature is one of a lengthscale, and a parameter has a part in it. Where the lengthscale leaves its box before
 // the parameter has moved by its own deviation, that is known.
 TEST(LaplaceTest, WhatHardlyMovesAlongAnOpenDirectionIsKnown) {
@@ -364,6 +383,55 @@ TEST(LaplaceTest, NotesNameASingleOpenParameterManyCombinationsAndFitsThatStoppe
   EXPECT_FALSE(uncertainty_notes(report)[0].is_warning);
   EXPECT_EQ(uncertainty_notes(report)[0].text,
             "m and Ic are known much better together than each by itself (correlation -0.9910)");
+  // along what is open no optimum is near
+  u.stddev[0] = u.distance_from_optimum = infinity;
+  u.undetermined = Eigen::Vector3d(1, 0, 0);
+  EXPECT_EQ(uncertainty_notes(report).at(0).mend, "Know first what the data do not determine: along it no optimum is reached");
+}
+
+FitReport report_of_one(const HyperPrior& prior, double value) {
+  FitReport report;
+  Hyperparameter& g = report.hyperparameters.emplace_back(Hyperparameter::of(Kind::parameter, 0, 0));
+  g.name = "g";
+  g.value = value;
+  g.lower = 5;
+  g.upper = 15;
+  g.hyperprior = prior;
+  LaplaceUncertainty& u = report.uncertainty.emplace();
+  u.correlation = MatrixXd::Identity(1, 1);
+  u.stddev = VectorXd::Constant(1, g.at_bound() ? 0 : 0.05);
+  return report;
+}
+
+TEST(LaplaceTest, NotesTellOfPriorsThatTheDataContradict) {
+  const HyperPrior prior{HyperPrior::Form::normal, 9.81, 0.1};
+  EXPECT_TRUE(uncertainty_notes(report_of_one(prior, 9.6)).empty());
+  EXPECT_TRUE(uncertainty_notes(report_of_one({}, 12)).empty());
+  const std::vector<UncertaintyNote> far = uncertainty_notes(report_of_one(prior, 10.67));
+  ASSERT_EQ(far.size(), 1U);
+  EXPECT_TRUE(far[0].is_warning);
+  EXPECT_EQ(far[0].text, "g = 10.67 lies 8.6 deviations of its prior from the middle of that, 9.81");
+  const std::vector<UncertaintyNote> outside = uncertainty_notes(report_of_one({HyperPrior::Form::normal, 20, 0.1}, 15));
+  ASSERT_EQ(outside.size(), 1U);
+  EXPECT_EQ(outside[0].text, "g = 15 lies 50 deviations of its prior from the middle of that, 20, which its bounds forbid");
+  const HyperPrior of_logarithm{HyperPrior::Form::log_normal, 9.81, 0.01};
+  EXPECT_EQ(uncertainty_notes(report_of_one(of_logarithm, 10.67)).size(), 1U);
+}
+
+TEST(LaplaceTest, NotesSayWhichParametersStandardErrorsHoldAtABound) {
+  FitReport report = report_of_one({}, 15);
+  EXPECT_TRUE(uncertainty_notes(report).empty()) << "no other has an error";
+  Hyperparameter& k = report.hyperparameters.emplace_back(Hyperparameter::of(Kind::parameter, 0, 1));
+  k.name = "k";
+  k.lower = -1;
+  k.upper = 1;
+  k.value = 0.5;
+  report.uncertainty->stddev = Eigen::Vector2d(0, 0.01);
+  report.uncertainty->correlation = MatrixXd::Identity(2, 2);
+  const std::vector<UncertaintyNote> notes = uncertainty_notes(report);
+  ASSERT_EQ(notes.size(), 1U);
+  EXPECT_FALSE(notes[0].is_warning);
+  EXPECT_EQ(notes[0].text, "the standard errors hold g at the bound");
 }
 
 }  // namespace

@@ -119,6 +119,45 @@ TEST(RobustTest, OutliersAreFoundAndTheFitIsNearlyThatOfCleanData) {
   }
 }
 
+TEST(RobustTest, NoiseThatIsEstimatedIsThatOfAllOtherValues) {
+  Data clean = data_of("models/surface.toml", 60);
+  const Observations group = clean.observations.front();
+  clean.observations.front() = group.with_noise(Noise(group.noise().stddev(), /*estimated=*/true));
+  Data dirty = clean;
+  MatrixXd values = group.values();
+  const double spread = row_stddev(values)[0];
+  values(0, 5) += 1.5 * spread, values(0, 20) -= 2 * spread, values(0, 40) += 3 * spread;
+  dirty.observations.front() = clean.observations.front().with_values(values);
+  const auto noise_of = [](Data& data) {
+    data.set_hyperparameters();
+    const Fit robust = fit_robust(data.prior, data.observations, data.hyperparameters, quick_robust());
+    return std::pair(robust.posterior.values().noise_stddev.front()[0], robust.report.distrusted.size());
+  };
+  const auto of_clean = noise_of(clean), of_dirty = noise_of(dirty);
+  EXPECT_EQ(of_dirty.second, of_clean.second + 3);
+  EXPECT_NEAR(of_dirty.first / of_clean.first, 1, 0.2);
+}
+
+TEST(RobustTest, NoValueIsDistrustedThatItsNoiseExplains) {
+  const Data dirty = with_outliers(data_of("models/surface.toml", 40), 0.05, false);
+  const Fit robust = fit_robust(dirty.prior, dirty.observations, dirty.hyperparameters, quick_robust(), {.threshold = 0.5});
+  ASSERT_FALSE(robust.report.distrusted.empty());
+  for (const DistrustedValue& value : robust.report.distrusted) EXPECT_GT(value.noise_factor, 1);
+}
+
+TEST(RobustTest, ThroughInducingPointsEachDrawHasSumsOfItsOwn) {
+  const Data clean = data_of("models/surface.toml", 40);
+  FitOptions options = quick_robust();
+  options.max_iterations = 10;
+  options.n_inducing = 20;
+  options.n_draws = 2;
+  const Fit robust = fit_robust(clean.prior, clean.observations, clean.hyperparameters, options);
+  ASSERT_TRUE(robust.report.draws.has_value());
+  EXPECT_EQ(robust.posterior.n_components(), robust.report.draws->size());
+  EXPECT_EQ(posterior_of(clean.prior, robust.posterior.observations(), robust.report).negative_log_likelihood(),
+            robust.posterior.negative_log_likelihood());
+}
+
 TEST(RobustTest, OfCleanDataNextToNothingIsDistrusted) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
     SCOPED_TRACE(fmt::format("{}, seed {}", file, robust_seed));

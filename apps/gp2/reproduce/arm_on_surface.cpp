@@ -1,7 +1,5 @@
 #include <algorithm>
 #include <chrono>
-#include <cmath>
-#include <numeric>
 
 #include <fmt/format.h>
 

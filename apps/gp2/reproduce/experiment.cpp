@@ -1,12 +1,9 @@
 #include "reproduce/experiment.hpp"
 
 #include <algorithm>
-#include <cmath>
 #include <memory>
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
-#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/error.hpp"

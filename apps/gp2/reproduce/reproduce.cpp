@@ -86,25 +86,21 @@ Command reproduce_command() {
   const auto a = std::make_shared<ReproduceArguments>();
   std::vector<std::pair<std::string, std::string>> names = {{"all", "all"}};
   for (const Experiment& experiment : experiments) names.emplace_back(experiment.name, experiment.name);
-  Command command{"reproduce",
-                  "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
-                  "gp2 reproduce table1 --runs 2 -o results",
-                  {},
-                  {}};
   Option what{"what", choice(a->what, names), "", "which"};
   what.flag = "WHAT";
-  command.options = {
-      required(std::move(what)),
-      {"protocol", choice(a->protocol, {{"paper", "paper"}, {"default", "default"}, {"both", "both"}}), "",
-       "how GP² is trained: paper, default, or both; the other methods are the same under each"},
-      {"data", &a->data, "DIR", "folder of the published observations; without it they are drawn from the same distributions"},
-      {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
-      threads_option(a->threads),
-      {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
-      output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)"),
-  };
-  command.run = [a](const std::set<std::string>&) { run(*a); };
-  return command;
+  return {
+      "reproduce",
+      "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
+      "gp2 reproduce table1 --runs 2 -o results",
+      {required(std::move(what)),
+       {"protocol", choice(a->protocol, {{"paper", "paper"}, {"default", "default"}, {"both", "both"}}), "",
+        "how GP² is trained: paper, default, or both; the other methods are the same under each"},
+       {"data", &a->data, "DIR", "folder of the published observations; without it they are drawn from the same distributions"},
+       {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
+       threads_option(a->threads),
+       {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
+       output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)")},
+      [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

@@ -1,7 +1,5 @@
 #include "reproduce/table.hpp"
 
-#include <cmath>
-
 #include <fmt/format.h>
 
 #include "command.hpp"
@@ -32,10 +30,6 @@ void Table::write(const std::filesystem::path& stem) const {
     }
   });
   write_file(stem.string() + ".json", nlohmann::ordered_json(rows_).dump(1) + "\n");
-}
-
-nlohmann::ordered_json number_or_null(double value) {
-  return std::isfinite(value) ? nlohmann::ordered_json(value) : nlohmann::ordered_json();
 }
 
 }  // namespace gp2::command

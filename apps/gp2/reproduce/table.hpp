@@ -2,12 +2,11 @@
 
 #include <filesystem>
 #include <initializer_list>
-#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
 
-#include <nlohmann/json.hpp>
+#include "json.hpp"
 
 namespace gp2::command {
 
@@ -25,8 +24,5 @@ class Table {
  private:
   std::vector<Row> rows_;
 };
-
-/// A number, or null where it is not finite.
-nlohmann::ordered_json number_or_null(double value);
 
 }  // namespace gp2::command

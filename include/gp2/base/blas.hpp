@@ -13,14 +13,14 @@ struct ProcessorFeatures {
   bool avx512 = false;  // AVX-512 F, CD, BW, DQ and VL
 };
 
-/// Those of this machine.
+/// The vector instructions of this machine.
 ProcessorFeatures processor_features();
 
 /// The kernel to ask OpenBLAS for, by the environment variable OPENBLAS_CORETYPE.
 ///
 /// OpenBLAS holds its routines once for each of many processors, the kernels, and takes the one made for the processor that it
-/// recognises. What it does not recognise, or a setting that has come with the environment, may leave it with a kernel for
-/// narrower vectors than the processor has.
+/// recognises. A processor that it does not recognise, or a setting in the environment, may leave it with a kernel for narrower
+/// vectors than the processor has.
 ///
 /// @param kernel_in_use  its name as OpenBLAS has it, say "Haswell"
 /// @return "SkylakeX" with AVX-512 and "Haswell" with AVX2 where the kernel in use does not use these instructions; "" where it
@@ -37,7 +37,7 @@ struct BlasReport {
   std::string advice;          // what to set and why, one line; "" when there is nothing to mend
 };
 
-/// What the library says about itself.
+/// The BLAS settings in use, as the library tells them.
 ///
 /// gp2's library changes one setting of the process, and for a time only: while a fit, a posterior or samples are computed,
 /// OpenBLAS uses one thread, or those of the fit for a single large matrix, since the bits of a result must not depend on its

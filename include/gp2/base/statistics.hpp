@@ -12,6 +12,10 @@ namespace gp2 GP2_API {
 Eigen::VectorXd row_mean(const Eigen::Ref<const Eigen::MatrixXd>& values);
 /// Standard deviation (divided by their number) of each row, likewise.
 Eigen::VectorXd row_stddev(const Eigen::Ref<const Eigen::MatrixXd>& values);
+/// The largest |entry| of each row, likewise; 0 where none is.
+Eigen::VectorXd row_size(const Eigen::Ref<const Eigen::MatrixXd>& values);
+/// Standard deviation of each row; 0 where it does not vary but for the rounding of its size.
+Eigen::VectorXd row_spread(const Eigen::Ref<const Eigen::MatrixXd>& values);
 /// The entries of row k that are measured, in their order: those that are not NaN.
 std::vector<double> measured_entries(const Eigen::Ref<const Eigen::MatrixXd>& values, Eigen::Index k);
 /// The median of |x| under a normal distribution of mean 0 and standard deviation 1.

@@ -31,8 +31,9 @@ struct CSource {
 /// allocate nothing and are reentrant: whoever calls them has a workspace. NAME_self_test predicts at states whose predictions
 /// by Predictor stand in the file.
 ///
-/// In single precision all of it is float, the mechanics too. What the sums over the points of a posterior may be off by,
-/// (n/8 + 16) ε Σ_j |k_j β_j| of each latent function, is held against the standard deviation of that function at observed states.
+/// In single precision all of it is float, the mechanics too. What rounding of the terms alone makes of the sums over the points of a
+/// posterior, ε Σ_j |k_j β_j| of each latent function, is held against the standard deviation of that function at observed states;
+/// rounding of the n additions may make up to n/8 + 16 times as much.
 ///
 /// @throws InputError as require_view; when the name is no C identifier, there are no observations, the system, features or
 ///   directions are code and not expressions, or single precision is off by more than a hundredth of a standard deviation.

@@ -19,7 +19,7 @@ namespace gp2 GP2_API {
 Eigen::VectorXd central_coverage(const Eigen::Ref<const Eigen::VectorXd>& z, const Eigen::Ref<const Eigen::VectorXd>& levels);
 
 /// Histogram of the probability integral transform Φ(z), flat for errors as large as predicted: the share of it in each of `n_bins`
-/// equal parts of [0, 1]. NaN as central_coverage.
+/// equal parts of [0, 1]. NaN as central_coverage. @throws InputError when there are no bins.
 Eigen::VectorXd pit_histogram(const Eigen::Ref<const Eigen::VectorXd>& z, int n_bins);
 
 /// How errors lie within their predicted Gaussian marginals; NaN where there is nothing to average.
@@ -81,7 +81,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Eigen::Ref<con
                                 const std::vector<int>& rows, const Eigen::Ref<const Eigen::MatrixXd>& targets,
                                 const EvaluationOptions& options = {});
 
-/// How the measured values of a row of ddq lie about what all others say of them: z = (y − mean)/√(variance + σ²) of leave_one_out,
+/// How the measured values of a row of a view lie about what all others say of them: z = (y − mean)/√(variance + σ²) of leave_one_out,
 /// which in a sound fit is standard normal.
 struct TrainingResidual {
   std::size_t group = 0;  // of the observations
@@ -89,28 +89,36 @@ struct TrainingResidual {
   int n = 0;                      // measured values
   double rms = 0;                 // of z
   double coverage95 = 0;          // share of |z| below 1.96
-  double serial_correlation = 0;  // of z from one state to the next, in the order of the observations
+  double serial_correlation = 0;  // of z of ddq from one state to the next, in the order of the observations
   double rms_in_noise = 0;        // of (y − mean)/σ, of which the noise alone makes 1
   int n_far = 0;                  // values with |z| above six times the larger of 1 and the median |z|/0.6745
   double farthest = 0;            // of |z|
   int farthest_state = -1;        // of the observations; −1 where only some states are kept
+  bool is_of_ddq = true;          // else of another view, which may be known and not measured
 
   /// Whether z is larger than chance and fitted hyperparameters make it.
   [[nodiscard]] bool is_too_large() const;
   /// Whether z goes on from state to state: the states follow each other in time, and something is missing that lasts longer.
   [[nodiscard]] bool is_correlated() const;
-  /// Whether the errors are far smaller than the noise that they have in them is said to be.
+  /// Whether the errors of ddq are far smaller than the noise that they have in them is said to be.
   [[nodiscard]] bool is_too_small() const;
 };
 
-/// How well a fit predicts its own data where it has not seen them, under the hyperparameters that it has from all of them.
-struct CrossValidation {
+/// Scores of what is measured of one view, by the spread of each output over all data; no latent figures.
+struct LeftOutScores {
+  std::string view;                           // multipliers, …, with `@LATENT` where it is of one; empty: ddq
+  Evaluation::Part one_by_one;                // each row from all others: between the data
+  std::optional<Evaluation::Part> stretches;  // leave_out in CrossValidation::n_stretches: what a motion elsewhere would meet
+  Evaluation::Part values;    // each value from all others, those of its row too: by these single values are judged
+  double nrmse_of_noise = 0;  // which the noise alone would give all
+};
+
+/// How well a fit predicts its own data where it has not seen them, under the hyperparameters that it has from all of them: of ddq,
+/// or where none is observed of the first other view.
+struct CrossValidation : LeftOutScores {
   static constexpr int n_stretches = LeftOut::n_stretches;
-  /// Scores of the measured values of ddq, by the spread of each output over all data; no latent figures.
-  Evaluation::Part one_by_one;                // each from all others: between the data
-  std::optional<Evaluation::Part> stretches;  // leave_out in n_stretches: what a motion elsewhere would meet
-  std::vector<TrainingResidual> residuals;    // one for each row of each observation of ddq
-  double nrmse_of_noise = 0;                  // which the noise alone would give both scores
+  std::vector<LeftOutScores> other_views = {};
+  std::vector<TrainingResidual> residuals = {};  // one for each row of each observation
 
   [[nodiscard]] std::string text() const;
   /// Whether half of the spread of stretches that were left out, or more, is neither predicted nor noise.

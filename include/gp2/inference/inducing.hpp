@@ -12,8 +12,9 @@
 namespace gp2 GP2_API {
 
 struct InducingOptions {
-  int most = 1000;      // inducing variables of all latents together
-  double left_out = 1;  // t at which no more points are taken
+  int most = 1000;         // inducing variables of all latents together
+  int of_discrepancy = 0;  // at most, of these, of a discrepancy
+  double left_out = 1;     // t at which no more points are taken
   int n_candidates =
       5000;  // observed states that are looked at, spread evenly; half as many more where these do not stand for all
 };
@@ -25,8 +26,8 @@ struct InducingChoice {
 };
 
 /// Inducing points among the observed states, one after another: the latent and the state that reduce t of the bound most (greedy
-/// pivoted Cholesky factorisation; theory.md, T37), until t is small, nothing is left in double precision, or there are enough; none for
-/// a discrepancy, which has no part in t (T38). Of more states than candidates t is taken of all of them; where it is far more than the
+/// pivoted Cholesky factorisation; theory.md, T37), until t is small, nothing is left in double precision, or there are enough. A discrepancy
+/// has no part in t (T38), and gets its points after all others. Of more states than candidates t is taken of all of them; where it is far more than the
 /// candidates tell, the stretches of which most is left out are candidates too.
 /// @throws InputError where the options make no sense; and as Likelihood.
 InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,

@@ -112,9 +112,6 @@ class InverseDynamicsSolver {
 
  private:
   [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
-  [[nodiscard]] Status find(const Eigen::Ref<const Eigen::VectorXd>& state,
-                            const Eigen::Ref<const Eigen::VectorXd>& accelerations, Eigen::Ref<Eigen::VectorXd>& inputs,
-                            Workspace& workspace) const;
 
   std::shared_ptr<const Implementation> implementation_;
 };

@@ -33,11 +33,13 @@ struct LeaveOneOut {
 /// @throws InputError and NumericalError, as Posterior.
 std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior);
 
-/// Every value as predicted without itself, and without the stretch of time around it.
+/// Every value as predicted without itself, without its row, and without the stretch of time around it.
 struct LeftOut {
   static constexpr int n_stretches = 5;  // that are known through inducing points
 
   std::vector<LeaveOneOut> values;     // leave_one_out
+  std::vector<LeaveOneOut> rows;       // what all but those of its own state say of each value, in another view too; NaN where
+                                       // double precision cannot tell
   std::vector<LeaveOneOut> stretches;  // what all but those of its own stretch say of each value; empty where not asked for,
                                        // where double precision cannot tell, and where what was learned through inducing points
                                        // was read from a file or got more observations
@@ -45,12 +47,12 @@ struct LeftOut {
 
 /// The states of each Observations are taken in time order: by t where all of them have one, else in their own. They are cut into
 /// `n_stretches` parts of equal number; the first parts of all Observations are left out together, then the second parts, … A part
-/// B of whole states is left out as a value is, by the same inversion:
+/// B of whole states, or a state, is left out as a value is, by the same inversion:
 ///
 ///     ỹ_B − mean_B = P_BB⁻¹ α̃_B,    covariance_B = P_BB⁻¹ − I,
 ///
 /// which Q brings to the whitened values e and S^{1/2} to the values. The variance holds what slips where constraints are soft. Of a
-/// mixture all components count alike.
+/// mixture all components count alike where a stretch is left out, and draw i as 1/p_i(y_B | others) where a state is.
 /// @param n_stretches  0: none; through inducing points none, or LeftOut::n_stretches
 /// @throws InputError and NumericalError, as Posterior.
 LeftOut leave_out(const Posterior& posterior, int n_stretches);

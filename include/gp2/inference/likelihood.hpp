@@ -42,9 +42,10 @@ class Likelihood {
   /// Memory reused between calls; one per thread that calls.
   class Workspace {
    public:
-    /// @param workers    on one evaluation; other processes through inducing points only. Threads are used where there are samples enough for it to pay. The sums keep their order
-    ///                   whatever it is; a factorisation of more than 2000 rows on several threads is rounded differently.
-    /// @param stop       set: `evaluate` gives up within a second or so and returns +∞
+    /// @param workers  on one evaluation; other processes through inducing points only. Threads are used where there are enough
+    ///                 samples for it to pay. The sums keep their order whatever it is; a factorisation of more than 2000 rows
+    ///                 on several threads is rounded differently.
+    /// @param stop     set: `evaluate` gives up within a second or so and returns +∞
     explicit Workspace(const Workers& workers = {}, const std::atomic<bool>* stop = nullptr);
     ~Workspace();
 

@@ -22,7 +22,7 @@ namespace gp2 GP2_API {
 enum class HyperparameterChoice {
   optimise,   // the likeliest are taken as known
   integrate,  // drawn given the data; the posterior is the mixture over the draws
-  automatic,  // integrate where integration_pays, else optimise
+  automatic,  // integrate where that pays: directions have hyperparameters of their own, and rows are few; else optimise
 };
 
 /// Draws that `integrate` mixes, through inducing points fewer, each of which has sums of its own; and the largest reduced size
@@ -34,10 +34,6 @@ inline constexpr int n_mixed_draws = 25, n_mixed_draws_through_points = 8, large
 inline constexpr int largest_exact_size = 1500, most_inducing_variables = 1000;
 /// The same of so many rows: fewer beyond 100 000, so that an evaluation of the likelihood of a million takes some ten seconds.
 int automatic_inducing_variables(std::int64_t n_rows);
-
-/// The rule of `auto`: the directions of a latent have hyperparameters of their own, as in the default prior, the reduced size is
-/// small enough, it is no baseline, and the optimiser runs.
-bool integration_pays(const FitProblem& problem, const FitOptions& options);
 
 /// What a fit is asked for: a model, its data, and options.
 struct FitRequest {
@@ -103,9 +99,6 @@ struct FitOutcome {
   std::vector<std::string> notes;                   // what a person should know
   std::optional<CrossValidation> cross_validation;  // unless the fit was interrupted, or its residuals cannot be told
 };
-
-/// Whether its observations stand in the order of their logs: `max_points` shuffles them.
-bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations);
 
 /// cross_validate of the posterior of a fit; what the fit knows and the posterior does not, stretches of many rows, is as it was then.
 CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior);

@@ -125,11 +125,6 @@ std::vector<std::string> distrust_notes(const FitProblem& problem, const FitRepo
 /// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
 LatentRange latents_called(const Prior& prior, const std::string& name, const std::string& option);
 
-/// Names of columns for logs that are read together: those given, then the model's own [columns].
-/// @throws InputError when `columns` names what the model does not have, or none of the logs has.
-std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
-                                                   const std::map<std::string, std::string>& columns);
-
 /// A reader of a log that knows the columns by `columns` (model's name -> log's name), then by the model's own [columns].
 /// @throws InputError when `columns` names what the model or the log does not have.
 LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::string, std::string>& columns);

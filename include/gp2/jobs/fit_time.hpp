@@ -15,9 +15,10 @@ namespace gp2 GP2_API {
 double evaluation_seconds(const FitProblem& problem, const FitOptions& options, int reduced_size);
 
 /// A note where an evaluation takes more than 10 s.
-void note_time(double seconds, int reduced_size, std::vector<std::string>& notes);
+/// @param takes_points  whether inducing points may stand for the rows
+void note_time(double seconds, int reduced_size, std::vector<std::string>& notes, bool takes_points = true);
 
-/// The same of a fit; a small one is not timed.
+/// The same of a fit; a small one is not timed, nor one to windows, whose states are few.
 void note_time(const FitProblem& problem, const FitOptions& options, int reduced_size, std::vector<std::string>& notes);
 
 }  // namespace gp2

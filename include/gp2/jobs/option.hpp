@@ -123,6 +123,8 @@ inline Option not_recorded(Option option) {
 Option threads_option(int& threads);
 /// @throws InputError when it is negative.
 void require_threads(int threads);
+/// "map", in every job that reads a log.
+Option columns_option(std::map<std::string, std::string>& columns, const std::string& text = "columns by other names");
 
 /// The entry of a name; null where there is none.
 const Option* find_option(const std::vector<Option>& options, const std::string& name);

@@ -81,6 +81,15 @@ struct PredictOutcome {
 void require_memory_of_samples(const Posterior& posterior, const View& view, Eigen::Index n_states, int n_samples,
                                std::optional<double> free);
 
+/// A note of states that are far from the data.
+/// @param distance  Posterior::distance_from_data
+std::optional<std::string> note_of_distance(const Eigen::VectorXd& distance);
+/// A note of what the data tell little of, where deviations are no better than what the prior assumes.
+/// @param mean      of the view at the states
+/// @param distance  of these from the data
+std::optional<std::string> note_of_untold(const Posterior& posterior, const PredictedView& at, const Eigen::MatrixXd& states,
+                                          const Eigen::MatrixXd& mean, const Eigen::VectorXd& distance);
+
 /// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name; NumericalError as
 ///   inverse_dynamics.
 PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request);

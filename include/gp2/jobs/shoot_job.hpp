@@ -26,7 +26,7 @@ std::vector<Option> options(ShootRequest& request);
 struct ShotParameter {
   std::string name, unit;
   double one_step = 0, one_step_stddev = 0;  // NaN where the fit has none
-  double value = 0, stddev = 0;
+  double value = 0, stddev = 0;              // NaN with fewer than four stretches
 };
 
 struct ShootOutcome {

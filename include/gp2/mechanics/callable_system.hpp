@@ -73,7 +73,6 @@ class CallableSystem final : public System {
   void require_shapes(const char* function, const SystemValues& values, Eigen::Index n_states) const;
   void require_finite(const char* function, const SystemValues& values, const States& states) const;
   void require_symmetry(const char* function, const SystemValues& values, int i, bool derivative) const;
-  [[nodiscard]] SystemValues difference(const States& states, const Parameters& parameters, int index) const;
 
   Definition definition_;
   std::vector<Residual> residual_labels_;

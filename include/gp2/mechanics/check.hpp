@@ -56,14 +56,17 @@ LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
 LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
-/// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of
-/// them are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
+/// Whether measured accelerations obey rows of A ddq = b, or combinations of them, to rounding or to 3 % of their noise: then they
+/// were computed from each other, and only nq − rank of these combinations are independent measurements. Treating all as independent
+/// makes an estimated noise collapse to zero.
 ///
 /// @param accelerations  (nq × N); states with one that is not measured (NaN) are left out
+/// @param stddev         of their noise (nq × N); NaN, or empty: not known
 /// @returns the rows of ddq to observe instead (the best-conditioned independent set); nothing when the columns are independent.
 std::optional<std::vector<int>> dependent_columns(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
-                                                  const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+                                                  const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
+                                                  const Eigen::Ref<const Eigen::MatrixXd>& stddev = Eigen::MatrixXd());
 
 /// Measured accelerations against one row of A ddq = b: r = A ddq − b is what noise makes of it, if the model and the data are right.
 struct ConstraintResidual {
@@ -78,6 +81,8 @@ struct ConstraintResidual {
   /// Whether r is more than noise: more than twice what is expected, beyond what chance does to n values; where the noise is not
   /// known, an offset that stands out of the scatter, or half as large as the terms that should cancel.
   [[nodiscard]] bool is_too_large() const;
+  /// Whether r is less than half of what the noise makes, beyond what chance does to n values.
+  [[nodiscard]] bool is_too_small() const;
   /// "the residual of 'z - h*x^2' is 9.69, expected 0.2 from the noise: 48 ×, …": what it means, for people.
   [[nodiscard]] std::string text() const;
 };
@@ -104,9 +109,11 @@ std::vector<Finding> check_system(const System& system, const Eigen::Ref<const E
 /// @param accelerations  (nq × N); NaN where not measured
 /// @param stddev         of their noise (nq × N); NaN: not known
 /// @param stated         rows of ddq whose standard deviations the log states: those that a fit observes; empty: all
+/// @param estimates_noise  whether deviations that are not stated are only a start, from which a fit finds them
 std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                 const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
-                                const Eigen::Ref<const Eigen::MatrixXd>& stddev, const std::vector<int>& stated = {});
+                                const Eigen::Ref<const Eigen::MatrixXd>& stddev, const std::vector<int>& stated = {},
+                                bool estimates_noise = false);
 
 }  // namespace gp2

@@ -14,7 +14,8 @@
 
 namespace gp2 GP2_API {
 
-/// States drawn from a model's [sampling] and what its [truth] says of them.
+/// States drawn from a model's [sampling], or met in its [motion], and what its [truth] says of them: where dry friction holds a
+/// driven body, that it rests.
 struct GeneratedData {
   Eigen::MatrixXd states;         // (layout size × N); NaN where the model does not read an entry
   Eigen::MatrixXd accelerations;  // ddq = L b + T (M⁻¹F + truth), plus noise and slip (nq × N)
@@ -32,8 +33,8 @@ struct GenerateOptions {
 /// Draws states, solving the constraints for coordinates and velocities that [sampling] leaves open, and measures them. Of a
 /// system that gives no residuals there is nothing to solve: [sampling] must give all it reads, on its constraints.
 /// @throws InputError when the grid leaves out a range or names another; when [sampling] or [truth] is missing, leaves open what
-/// the constraints do not decide, or puts a state off
-///   the constraints; when n < 1 or noise_stddev is not of nq finite numbers ≥ 0.
+///   the constraints do not decide, or puts a state off the constraints; when a model with [motion] has contacts; when n < 1 or
+///   noise_stddev is not of nq finite numbers ≥ 0.
 /// @throws NumericalError when Newton's method does not reach the constraints.
 GeneratedData generate(const Model& model, const GenerateOptions& options);
 

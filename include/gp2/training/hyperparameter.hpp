@@ -106,8 +106,8 @@ struct Hyperparameter {
   [[nodiscard]] double likelihood_slope(const ModelGradient& gradient) const;
 };
 
-/// @throws InputError when hyperparameters are not of this prior and these observations, a value is not finite or, where it is
-/// positive by nature, not positive, or bounds are not in order.
+/// @throws InputError when hyperparameters are not of this prior and these observations, one stands twice, a value is not finite or,
+/// where it is positive by nature, not positive, or bounds are not in order.
 void require_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
                              const std::vector<Hyperparameter>& hyperparameters);
 

@@ -22,7 +22,7 @@ struct RobustOptions {
 /// fit() of observations some of which are wrong. A value is distrusted when it lies more than `threshold` standard deviations,
 /// of the noise and the prediction, from what all others predict: r² > threshold² (v + σ²) by leave_one_out. Its noise is then
 /// taken to be √(r² − v), under which its likelihood is largest (as in the relevance pursuit of Ament et al. 2024), its weight in
-/// the fit being that much smaller. Hyperparameters and the choice of values are found in turns until the choice stays, from two
+/// the fit being that much smaller. Hyperparameters and the choice of values are found in turns until choice and noise stay, from two
 /// starts: outliers hide behind each other where a fit explains them all. The lower objective wins, plus what distrusting a value
 /// at the threshold lowers it by, for each. What all others say of a value does not depend on its own noise, so one wrongly
 /// distrusted is readmitted. Where more than half of a row's values are farther off than noise should be, distances are relative

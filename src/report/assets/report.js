@@ -525,10 +525,10 @@
 
   function rolloutLead(motion) {
     if (motion.reason) return `There is none for the ${data.name} data: ${motion.reason}.`;
-    const [start, end] = [motion.t[0], motion.t[motion.t.length - 1]];
+    const start = motion.t[0], reached = motion.t[motion.simulated[0].filter((value) => value !== null).length - 1];
     const within = `within its band, or 5 % of the measured range,`;
     const parts = [motion.leaves === null
-      ? `Over the ${format(end - start, 4)} s shown the simulated motion stays with the measured one of the ${data.name} data: ${within} to the end.`
+      ? `Over the ${format(reached - start, 4)} s ${motion.ended ? "that it reached" : "shown"} the simulated motion stays with the measured one of the ${data.name} data: ${within} to the end.`
       : `The simulated motion stays with the measured one of the ${data.name} data ${within} for ${format(motion.leaves - start, 3)} s; ${model.coordinates[motion.leaving]} leaves first, at t = ${format(motion.leaves, 4)}.`];
     if (motion.far_from !== null) parts.push(`From t = ${format(motion.far_from, 4)} on it is far from the training data.`);
     if (motion.ended) parts.push(`It ended early: ${motion.ended}.`);
