@@ -227,7 +227,11 @@ void check_latents(const Model& model, const Eigen::MatrixXd& states, std::vecto
     if (is_known) rows.push_back(i);
   }
   ActingStates acting(prior);
-  acting.count(prior, states(Eigen::all, rows), parameters);
+  if (std::ssize(rows) == states.cols()) {
+    acting.count(prior, states, parameters);
+  } else {
+    acting.count(prior, states(Eigen::all, rows), parameters);
+  }
   for (std::string& text : acting.idle_texts()) findings.push_back({Level::warning, std::move(text)});
   if (std::ranges::none_of(prior.latents, [&](const Latent& one) { return LoadCheck::reads_load(one, parameters); })) return;
   const auto stride = std::max<Eigen::Index>(1, std::ssize(rows) / enough);

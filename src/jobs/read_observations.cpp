@@ -750,16 +750,19 @@ ActingStates::ActingStates(const Prior& prior) {
 
 void ActingStates::count(const Prior& prior, const MatrixXd& states, const VectorXd& parameters) {
   n_states_ += states.cols();
-  if (std::ranges::count(acts_, false) == 0) return;
-  const auto fault = for_each_mechanics(
-      prior, View::constrained_acceleration(*prior.system), states, parameters, [&](Index first, const MechanicsBatch& block) {
-        const int n = block.values.n_states();
-        const PriorValues values = evaluate_prior(prior, states.middleCols(first, n), parameters, block);
-        for (std::size_t a = 0; a < acts_.size(); ++a) {
-          for (int i = 0; i < n && !acts_[a]; ++i) acts_[a] = values.fault || !values.E(a, i).isZero(0);
-        }
-      });
-  if (fault) std::fill(acts_.begin(), acts_.end(), true);  // others tell
+  constexpr Index piece = 1000;  // states, of which the first tell as a rule
+  const View view = View::constrained_acceleration(*prior.system);
+  for (Index from = 0; from < states.cols() && std::ranges::count(acts_, false) > 0; from += piece) {
+    const MatrixXd some = states.middleCols(from, std::min(piece, states.cols() - from));
+    const auto fault = for_each_mechanics(prior, view, some, parameters, [&](Index first, const MechanicsBatch& block) {
+      const int n = block.values.n_states();
+      const PriorValues values = evaluate_prior(prior, some.middleCols(first, n), parameters, block);
+      for (std::size_t a = 0; a < acts_.size(); ++a) {
+        for (int i = 0; i < n && !acts_[a]; ++i) acts_[a] = values.fault || !values.E(a, i).isZero(0);
+      }
+    });
+    if (fault) std::fill(acts_.begin(), acts_.end(), true);  // others tell
+  }
 }
 
 std::vector<std::string> ActingStates::idle_texts() const {

@@ -402,11 +402,13 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
                         fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
                                     violation->value, violation->relative, violation->constraint, violation->state + 1)});
   }
-  MatrixXd told = stddev;
-  for (int row = 0; row < system.nq() && estimates_noise; ++row) {
+  MatrixXd told;
+  if (estimates_noise) told = stddev;
+  for (int row = 0; row < told.rows(); ++row) {
     if (std::find(stated.begin(), stated.end(), row) == stated.end()) told.row(row).setConstant(not_a_number);
   }
-  const auto rows = dependent_columns(system, states, parameters, accelerations, told);
+  const auto rows = dependent_columns(system, states, parameters, accelerations,
+                                      estimates_noise ? Ref<const MatrixXd>(told) : Ref<const MatrixXd>(stddev));
   for (const ConstraintResidual& one : constraint_residuals(system, states, parameters, accelerations, stddev)) {
     // as large as what should cancel: nothing that is learned from such data is of this system
     const bool is_all = one.is_too_large() && one.rms > 0.3 * one.size && !estimates;
