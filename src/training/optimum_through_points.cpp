@@ -226,8 +226,10 @@ class TrainingThroughPoints {
   [[nodiscard]] InducingReport points_of_all(const FitReport& of_some) const {
     const InducingChoice choice = chosen(observations_, of_some.hyperparameters);
     if (std::ranges::none_of(prior_.latents, is_local)) return points_of(choice);
-    FitOptions options = options_;
+    FitOptions options = of_stage(0, 1, n_states(observations_));
     options.max_iterations = 0;
+    options.standard_errors = false;
+    options.improved = nullptr;  // checkpoints are of what is trained
     const FitReport found = conditioned(choice, observations_, of_some, options);
     return *discrepancy_too(observations_, found, options).inducing;
   }
