@@ -129,11 +129,11 @@ Option start_option(std::string& value) {
 void require_output(const std::string& output, const std::vector<std::string>& inputs, const char* option) {
   if (output.empty()) throw InputError(fmt::format("{}: expected the name of a file, got ''", option));
   const std::filesystem::path folder = std::filesystem::path(output).parent_path();
-  if (!folder.empty() && !std::filesystem::is_directory(folder)) {
+  std::error_code not_there;
+  if (!folder.empty() && !std::filesystem::is_directory(folder, not_there)) {
     throw InputError(fmt::format("{} {}: there is no folder '{}'; make it first", option, output, folder.string()));
   }
   require_writable(output);
-  std::error_code not_there;
   if (!std::filesystem::is_regular_file(output, not_there)) return;
   for (const std::string& input : inputs) {
     if (std::filesystem::equivalent(output, input, not_there)) {

@@ -31,13 +31,12 @@ int count(const std::vector<Finding>& findings, Finding::Level level) {
       std::count_if(findings.begin(), findings.end(), [&](const Finding& one) { return one.level == level; }));
 }
 
-void print_json(const std::vector<Finding>& findings) {
+void print_as_json(const std::vector<Finding>& findings) {
   nlohmann::ordered_json list = nlohmann::ordered_json::array();
   for (const Finding& finding : findings) list.push_back({{"level", word_of(finding.level)}, {"text", with_flags(finding.text)}});
-  const nlohmann::ordered_json all = {{"errors", count(findings, Finding::Level::error)},
-                                      {"warnings", count(findings, Finding::Level::warning)},
-                                      {"findings", list}};
-  print_result("{}\n", all.dump(2));
+  print_json({{"errors", count(findings, Finding::Level::error)},
+              {"warnings", count(findings, Finding::Level::warning)},
+              {"findings", list}});
 }
 
 void print(const std::vector<Finding>& findings) {
@@ -54,7 +53,7 @@ void run(const CheckArguments& arguments) {
   std::optional<CsvTable> log;
   if (!arguments.data.empty()) log = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
   const std::vector<Finding> findings = check(model, log ? &*log : nullptr, arguments.options);
-  (arguments.json ? print_json : print)(findings);
+  (arguments.json ? print_as_json : print)(findings);
   if (const int n_errors = count(findings, Finding::Level::error); n_errors > 0)
     throw InputError(fmt::format("{}: {} of the checks failed", arguments.model, n_errors));
 }

@@ -80,6 +80,15 @@ std::string with_links(const std::string& text) {
   return std::regex_replace(text, page, "[$1]($1)");
 }
 
+// CLI11 would take 010 for 8.
+template <typename T>
+bool is_whole_number(const std::string& text) {
+  T read = 0, meant = 0;
+  const char* const end = text.data() + text.size();
+  const auto [rest, error] = std::from_chars(text.data() + (text.starts_with('+') ? 1 : 0), end, meant);
+  return error == std::errc() && rest == end && CLI::detail::lexical_cast(text, read) && read == meant;
+}
+
 // CLI11 would take -1, and what is larger than the largest number there is, for that number.
 CLI::Validator not_negative() {
   const auto check = [](const std::string& text) {
@@ -87,7 +96,7 @@ CLI::Validator not_negative() {
     std::uint64_t number = 0;
     const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
     if (error == std::errc::result_out_of_range) return "must be below 2^64, got " + text;
-    return text.empty() || CLI::detail::lexical_cast(text, number) ? "" : fmt::format("expected a whole number, got '{}'", text);
+    return text.empty() || is_whole_number<std::uint64_t>(text) ? "" : fmt::format("expected a whole number, got '{}'", text);
   };
   return {check, ""};
 }
@@ -96,11 +105,14 @@ CLI::Validator not_negative() {
 template <typename T>
 CLI::Validator number_of_type() {
   const auto check = [](const std::string& text) {
-    T number = 0;
-    if (text.empty() || CLI::detail::lexical_cast(text, number)) return std::string();
-    const std::string kind =
-        std::is_integral_v<T> ? fmt::format("a whole number, at most {}", std::numeric_limits<T>::max()) : "a number";
-    return fmt::format("expected {}, got '{}'", kind, text);
+    if (text.empty()) return std::string();
+    if constexpr (std::is_integral_v<T>) {
+      if (is_whole_number<T>(text)) return std::string();
+      return fmt::format("expected a whole number, at most {}, got '{}'", std::numeric_limits<T>::max(), text);
+    } else {
+      T number = 0;
+      return CLI::detail::lexical_cast(text, number) ? std::string() : fmt::format("expected a number, got '{}'", text);
+    }
   };
   return {check, ""};
 }

@@ -5,11 +5,11 @@
 #include <utility>
 
 #include <fmt/format.h>
+#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/jobs/predict_job.hpp"
-#include "json.hpp"
 #include "streams.hpp"
 
 namespace gp2::command {
@@ -25,18 +25,18 @@ struct EvaluateArguments {
 };
 
 void add_to(Json& json, const Calibration& calibration) {
-  json["coverage50"] = number_or_null(calibration.coverage50);
-  json["coverage80"] = number_or_null(calibration.coverage80);
-  json["coverage95"] = number_or_null(calibration.coverage95);
-  json["coverage50_latent"] = number_or_null(calibration.coverage50_latent);
-  json["coverage80_latent"] = number_or_null(calibration.coverage80_latent);
-  json["coverage95_latent"] = number_or_null(calibration.coverage95_latent);
+  json["coverage50"] = calibration.coverage50;
+  json["coverage80"] = calibration.coverage80;
+  json["coverage95"] = calibration.coverage95;
+  json["coverage50_latent"] = calibration.coverage50_latent;
+  json["coverage80_latent"] = calibration.coverage80_latent;
+  json["coverage95_latent"] = calibration.coverage95_latent;
   json["pit"] = Json::array();
-  for (const double share : calibration.pit) json["pit"].push_back(number_or_null(share));
+  for (const double share : calibration.pit) json["pit"].push_back(share);
 }
 
 Json to_json(const Evaluation::Part& part) {
-  Json json = {{"n", part.n}, {"nrmse", number_or_null(part.nrmse)}};
+  Json json = {{"n", part.n}, {"nrmse", part.nrmse}};
   add_to(json, part);
   return json;
 }
@@ -45,12 +45,12 @@ Json to_json(const Evaluation& e) {
   Json rmse = Json::object();
   for (std::size_t k = 0; k < e.outputs.size(); ++k) rmse[e.outputs[k]] = e.rmse[static_cast<Eigen::Index>(k)];
   Json json = {{"rmse", rmse},
-               {"rmse_normalised", number_or_null(e.rmse_normalised)},
-               {"nrmse", number_or_null(e.nrmse)},
+               {"rmse_normalised", e.rmse_normalised},
+               {"nrmse", e.nrmse},
                {"max_constraint_error", e.max_constraint_error},
                {"max_constraint_error_fitted", e.max_constraint_error_fitted},
-               {"nlpd", number_or_null(e.nlpd)},
-               {"nlpd_latent", number_or_null(e.nlpd_latent)}};
+               {"nlpd", e.nlpd},
+               {"nlpd_latent", e.nlpd_latent}};
   add_to(json, e);
   json["n_zero_variance"] = e.n_zero_variance;
   json["near"] = to_json(e.near);
@@ -101,7 +101,7 @@ void run(EvaluateArguments& arguments) {
   const auto [evaluation, notes] = evaluate(fit, fit.posterior(), std::move(table), arguments.request);
   print_notes(notes);
   if (arguments.json) {
-    print_result("{}\n", to_json(evaluation).dump(2));
+    print_json(to_json(evaluation));
   } else {
     print_text(evaluation);
   }

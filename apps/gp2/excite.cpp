@@ -4,12 +4,12 @@
 #include <memory>
 
 #include <fmt/format.h>
+#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "interruption.hpp"
-#include "json.hpp"
 #include "streams.hpp"
 
 namespace gp2::command {
@@ -27,7 +27,7 @@ struct ExciteArguments {
 Json to_json(const std::vector<Excitation::Known>& known) {
   Json list = Json::array();
   for (const Excitation::Known& one : known) {
-    list.push_back({{"name", one.name}, {"now", one.now}, {"after", one.after}, {"random", number_or_null(one.random)}});
+    list.push_back({{"name", one.name}, {"now", one.now}, {"after", one.after}, {"random", one.random}});
   }
   return list;
 }
@@ -44,7 +44,7 @@ Json to_json(const Excitation& found) {
   }
   return {{"for", found.target == ExcitationTarget::parameters ? "parameters" : "accelerations"},
           {"factor", found.factor},
-          {"random_factor", number_or_null(found.random_factor)},
+          {"random_factor", found.random_factor},
           {"parameters", to_json(found.parameters)},
           {"accelerations", to_json(found.accelerations)},
           {"limits", limits},
@@ -123,7 +123,7 @@ void run(ExciteArguments& arguments) {
 
   as_table(found.motion, *driven.model->system, arguments.output).write(arguments.output);
   print_notes(notes_of(found, arguments));
-  if (arguments.json) print_result("{}\n", to_json(found).dump(2));
+  if (arguments.json) print_json(to_json(found));
   if (!found.interrupted) return;
   print_notes({fmt::format("{}: {} holds the best motion so far", interruption.text(), arguments.output)});
   throw Interrupted{interruption.signal()};

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
@@ -13,7 +14,6 @@
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
-#include "json.hpp"
 #include "ranks.hpp"
 #include "streams.hpp"
 
@@ -84,10 +84,10 @@ Json draws_json(const FitReport& report) {
 }
 
 Json to_json(const Evaluation::Part& scores) {
-  return {{"nrmse", number_or_null(scores.nrmse)},
-          {"coverage50", number_or_null(scores.coverage50)},
-          {"coverage80", number_or_null(scores.coverage80)},
-          {"coverage95", number_or_null(scores.coverage95)}};
+  return {{"nrmse", scores.nrmse},
+          {"coverage50", scores.coverage50},
+          {"coverage80", scores.coverage80},
+          {"coverage95", scores.coverage95}};
 }
 
 Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
@@ -108,10 +108,10 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
     for (std::size_t l = 0; l < report.hyperparameters.size(); ++l) {
       const Hyperparameter& other = report.hyperparameters[l];
       if (other.kind != Hyperparameter::Kind::parameter) continue;
-      correlation[other.name] = number_or_null(parameter_correlation(report, k, l));
+      correlation[other.name] = parameter_correlation(report, k, l);
     }
     const ParameterUncertainty known = parameter_uncertainty(report, k);
-    errors.push_back({{"name", h.name}, {"stddev", number_or_null(known.stddev)}, {"correlation", correlation}});
+    errors.push_back({{"name", h.name}, {"stddev", known.stddev}, {"correlation", correlation}});
     if (known.is_of_draws) errors.back().update(Json{{"mean", known.mean}, {"lower95", known.lower}, {"upper95", known.upper}});
   }
   Json json = {{"nll", report.negative_log_likelihood},
@@ -121,8 +121,7 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
                {"options", Json::parse(outcome.file.options)},
                {"hyperparameters", hyperparameters}};
   if (report.uncertainty) {
-    json["standard_errors"] = {{"parameters", errors},
-                               {"distance_from_optimum", number_or_null(report.uncertainty->distance_from_optimum)}};
+    json["standard_errors"] = {{"parameters", errors}, {"distance_from_optimum", report.uncertainty->distance_from_optimum}};
   } else if (!errors.empty()) {
     json["standard_errors"] = {{"parameters", errors}};
   }
@@ -139,7 +138,7 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
   for (const ActuatorEstimate& one : report.actuators) {
     json["actuators"].push_back({{"name", one.name},
                                  {"value", one.value},
-                                 {"stddev", number_or_null(one.stddev)},
+                                 {"stddev", one.stddev},
                                  {"lower", one.lower},
                                  {"upper", one.upper},
                                  {"at_bound", one.at_lower() || one.at_upper()}});
@@ -303,7 +302,7 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   const FitFile& file = outcome.file;
   const auto print = [&] {
     if (arguments.json) {
-      print_result("{}\n", to_json(job.problem, outcome).dump(2));
+      print_json(to_json(job.problem, outcome));
     } else {
       print_result("{}", text_of(file.report, file.model));
       if (outcome.cross_validation) print_result("{}\n", outcome.cross_validation->text());

@@ -35,6 +35,7 @@ constexpr int exit_bad_input = 2;
 
 int failed(int exit_code, const std::string& text) {
   static_cast<void>(std::fflush(stdout));  // where both go to one terminal or file, the results came first
+  gp2::command::end_progress();
   gp2::command::print_message("gp2: {}\n", text);
   gp2::command::abort_ranks(exit_code, text);
   return exit_code;

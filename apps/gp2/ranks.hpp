@@ -15,7 +15,7 @@ namespace gp2::command {
 int n_started_together();
 
 /// The processes that were started together, this one among them; null where it was started alone. All but the first are silent from
-/// then on, but for failed_alone().
+/// then on, but for what abort_ranks says.
 /// @throws InputError when gp2 was built without MPI, or they are no equals: other versions of gp2, other kernels of OpenBLAS.
 std::shared_ptr<const Ranks> join_ranks();
 

@@ -267,7 +267,7 @@ void run(const SimulateArguments& arguments) {
                   csv);
   });
   print_notes(notes_of(motions, subject.system(), job, arguments));
-  if (arguments.json) print_result("{}\n", report_of(motions, subject.system(), job).dump(2));
+  if (arguments.json) print_json(report_of(motions, subject.system(), job));
   if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));
 }
 

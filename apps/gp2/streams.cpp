@@ -8,6 +8,8 @@
 #include <fcntl.h>
 #include <unistd.h>
 
+#include <nlohmann/json.hpp>
+
 namespace gp2::command {
 
 namespace {
@@ -39,6 +41,10 @@ void write_stdout(std::string_view text) {
 void write_stderr(std::string_view text) {
   static_cast<void>(std::fwrite(text.data(), 1, text.size(), stderr));
   static_cast<void>(std::fflush(stderr));
+}
+
+void print_json(const nlohmann::ordered_json& json) {
+  print_result("{}\n", json.dump(2, ' ', /*ensure_ascii=*/false, nlohmann::ordered_json::error_handler_t::replace));
 }
 
 void be_quiet() { quiet = true; }

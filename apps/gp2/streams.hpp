@@ -4,6 +4,7 @@
 #include <utility>
 
 #include <fmt/format.h>
+#include <nlohmann/json_fwd.hpp>
 
 // What the command prints. A stream that cannot be written, of a full disk or a closed terminal, throws nothing and ends nothing:
 // no result is lost to it.
@@ -24,6 +25,8 @@ template <typename... Values>
 void print_result(fmt::format_string<Values...> format, Values&&... values) {
   write_stdout(fmt::format(format, std::forward<Values>(values)...));
 }
+/// Names of files and columns may be of any encoding: what is not UTF-8 is replaced.
+void print_json(const nlohmann::ordered_json& json);
 template <typename... Values>
 void print_message(fmt::format_string<Values...> format, Values&&... values) {
   write_stderr(fmt::format(format, std::forward<Values>(values)...));

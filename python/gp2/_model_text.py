@@ -77,7 +77,7 @@ def _require_mapping(name: str, value: Any) -> None:
 
 
 def _entries(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_key(key)} = {_value(value)}" for key, value in table.items() if value is not None]
+    return [f"{_key(str(key))} = {_value(value)}" for key, value in table.items() if value is not None]
 
 
 def _key(key: str) -> str:
@@ -98,7 +98,7 @@ def _value(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{ " + ", ".join(_entries(value)) + " }"
     if hasattr(value, "tolist"):  # of NumPy
-        value = value.tolist()
+        return _value(value.tolist())
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"
     raise TypeError(f"a model holds text, numbers, lists and mappings, not {type(value).__name__}: {value!r}")

@@ -131,9 +131,10 @@ def _with_hash(described: Any) -> Any:
 
 
 def _prepare() -> None:
-    # a system never changes: it is its own copy
-    setattr(_gp2.System, "__copy__", lambda self: self)
-    setattr(_gp2.System, "__deepcopy__", lambda self, memo: self)
+    # what never changes is its own copy
+    for fixed in (_gp2.System, _gp2.Table, _gp2.Log, _gp2.SideInformation):
+        setattr(fixed, "__copy__", lambda self: self)
+        setattr(fixed, "__deepcopy__", lambda self, memo: self)
     setattr(_gp2.System, "__eq__", _are_equal)
     setattr(_gp2.System, "__hash__", _hash_of)
     copyreg.pickle(_gp2.System, _reduce_system)  # type: ignore[arg-type]

@@ -47,7 +47,7 @@ def _plot_predictions(self: _gp2.Posterior, data: Any, system: Any = None, colum
     each output. Exact predictions lie on the line.
     """
     found = _gp2._compared(self, data, system, columns)  # type: ignore[attr-defined]
-    axes = np.atleast_1d(_axes(ax, len(found["outputs"]), 4))
+    axes = np.ravel(_axes(ax, len(found["outputs"]), 4))
     if axes.size != len(found["outputs"]):
         raise _gp2.InputError(f"ax: expected {len(found['outputs'])} axes, of {', '.join(found['outputs'])}; got {axes.size}")
     for k, output in enumerate(map(_text, found["outputs"])):

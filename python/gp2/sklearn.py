@@ -99,6 +99,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises gp2.InputError, a ValueError, where X, y, the options and the system do not go together; gp2.NumericalError.
         """
         system = self._given_system()
+        self._has_mechanics = system is not None
         if system is not None:
             outputs = self._outputs(system, y)
             y = _columns_by_name(y, outputs)
@@ -169,7 +170,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def score(self, X, y, sample_weight=None) -> float:
         """R² of the prediction, the mean over the columns of y."""
         check_is_fitted(self)
-        return super().score(X, y if self.system is None else _columns_by_name(y, self.outputs_), sample_weight)
+        return super().score(X, _columns_by_name(y, self.outputs_) if self._has_mechanics else y, sample_weight)
 
     def _given_system(self) -> gp2.System | None:
         if self.system is None or isinstance(self.system, gp2.System):
@@ -194,7 +195,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _columns_in_state(self, n_columns: int, given: list[str] | None) -> list[int]:
         names = self.system_.state_names
-        if self.system is None:
+        if not self._has_mechanics:
             return [names.index(name) for name in self.system_.inputs]
         unknown = [name for name in given or [] if name not in names]
         if unknown:
@@ -211,7 +212,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _checked_states(self, X) -> np.ndarray:
         check_is_fitted(self)
-        if self.system is None:
+        if not self._has_mechanics:
             return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False), None)
         # scikit-learn would compare number and order of the columns with those of fit, but the system says what they are
         given = _column_names("X", X)
@@ -287,6 +288,6 @@ def _columns_by_name(y, names: list[str]):
 
 
 def _seed(random_state) -> int:
-    if isinstance(random_state, (int, np.integer)):
+    if isinstance(random_state, (int, np.integer)) and random_state >= 0:
         return int(random_state)
     return int(check_random_state(random_state).randint(2**31))

@@ -17,13 +17,15 @@ namespace gp2::python {
 namespace {
 
 using DoubleArray = py::array_t<double, py::array::c_style>;
+// an array over the bytes of a file may begin anywhere
+constexpr int readable_in_place = int{py::array::c_style} | int{py::detail::npy_api::NPY_ARRAY_ALIGNED_};
 
 std::string shape_text(const py::array& array) {
   std::vector<py::ssize_t> shape(array.shape(), array.shape() + array.ndim());
   return fmt::format("({}{})", fmt::join(shape, ", "), shape.size() == 1 ? "," : "");
 }
 
-// itself where it holds C-contiguous doubles
+// itself where it holds C-contiguous doubles at addresses of doubles
 DoubleArray doubles(const py::object& object, const std::string& what) {
   const py::array array = py::array::ensure(without_mask(object));
   if (!array) {
@@ -35,7 +37,7 @@ DoubleArray doubles(const py::object& object, const std::string& what) {
     throw py::type_error(
         fmt::format("{}: expected an array of real numbers, got one of dtype {}", what, std::string(py::str(array.dtype()))));
   }
-  DoubleArray values = py::array_t<double, py::array::c_style | py::array::forcecast>::ensure(array);
+  DoubleArray values = py::array_t<double, readable_in_place | py::array::forcecast>::ensure(array);
   if (!values) throw std::bad_alloc();
   return values;
 }
@@ -78,6 +80,8 @@ py::object without_mask(const py::object& array) {
   if (kind != "f" && kind != "i" && kind != "u") return array;
   return array.attr("astype")("float64").attr("filled")(not_a_number);
 }
+
+py::object as_dict(const py::object& given) { return py::hasattr(given, "keys") ? py::object(py::dict(given)) : given; }
 
 Rows::Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what)
     : array_(doubles(in_order(array, names, what), what)) {
@@ -137,6 +141,8 @@ std::optional<py::list> column_names(const py::object& data) {
   py::list names;
   if (py::hasattr(data, "keys")) {
     names = py::list(data.attr("keys")());
+  } else if (py::hasattr(data, "column_names")) {  // of Arrow, whose `columns` are the values
+    names = py::list(data.attr("column_names"));
   } else if (py::hasattr(data, "columns")) {
     names = py::list(data.attr("columns"));
   } else {

@@ -32,6 +32,9 @@ class Rows {
 /// A masked array as one that is NaN where it is masked; all else as it is.
 py::object without_mask(const py::object& array);
 
+/// A mapping of any type, a pandas Series too, as a dict; all else as it is.
+py::object as_dict(const py::object& given);
+
 /// A vector of `size` numbers. @throws as Rows.
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, Eigen::Index size, const std::string& what);
 
@@ -43,7 +46,7 @@ py::array_t<double, py::array::c_style> vector_argument(const py::object& array,
 /// The same of any size.
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::string& what);
 
-/// The names of the columns of a mapping, a frame or a structured array, keys as they are; nothing of what is no table, or has only
+/// The names of the columns of a mapping, a frame, a table of Arrow or a structured array, keys as they are; nothing of what is no table, or has only
 /// numbers for names.
 std::optional<py::list> column_names(const py::object& data);
 

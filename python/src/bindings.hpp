@@ -63,6 +63,12 @@ struct PyPosterior {
 void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module);
 void define_excite(py::module_& module);
 
+/// @throws py::type_error for what cannot be called.
+void require_function(const py::object& given, const std::string& name);
+
+/// A FIT.json, read without the interpreter's lock. What is Python functions in it is that of `system`.
+FitFile read_fit(const py::object& path, const PySystem* system = nullptr);
+
 /// work() without the interpreter's lock.
 template <typename Work>
 auto unlocked(const Work& work) {
@@ -146,6 +152,20 @@ auto run_interruptibly(const Work& work, std::atomic<bool>& stop, std::exception
       stop = true;
     }
   }
+}
+
+/// The same of work(const std::atomic<bool>* stop). What a signal's handler raises is raised here, whatever work() made of its end.
+template <typename Work>
+auto run_or_raise(const Work& work) {
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
+  try {
+    auto result = run_interruptibly([&] { return work(&stop); }, stop, raised, [] {});
+    if (!raised) return result;
+  } catch (...) {
+    if (!raised) throw;
+  }
+  std::rethrow_exception(raised);
 }
 
 }  // namespace gp2::python

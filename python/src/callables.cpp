@@ -3,6 +3,7 @@
 #include "gp2/mechanics/callable_system.hpp"
 
 #include <algorithm>
+#include <iterator>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -120,24 +121,29 @@ SystemValues values_of(const py::object& result, const char* function, Index n, 
   return values;
 }
 
+std::vector<std::string> names_argument(py::handle given, const std::string& what) {
+  return argument<std::vector<std::string>>(given, what, "a list of names");
+}
+
 // names of rows of A, or {"position": names, "velocity": names, "acceleration": names}
 std::vector<CallableSystem::Constraint> constraints_of(const py::object& given) {
   std::vector<CallableSystem::Constraint> constraints;
-  const auto add = [&](const py::handle names, ConstraintLevel level) {
-    for (const auto& name : names.cast<std::vector<std::string>>()) constraints.push_back({name, level});
+  const auto add = [&](const py::handle names, const std::string& what, ConstraintLevel level) {
+    for (const auto& name : names_argument(names, what)) constraints.push_back({name, level});
   };
-  if (!py::isinstance<py::dict>(given)) {
-    add(given, ConstraintLevel::acceleration);
+  const py::object by_level = as_dict(given);
+  if (!py::isinstance<py::dict>(by_level)) {
+    add(by_level, "constraints", ConstraintLevel::acceleration);
     return constraints;
   }
-  for (const auto& [key, names] : given.cast<py::dict>()) {
-    const auto word = key.cast<std::string>();
+  for (const auto& [key, names] : py::reinterpret_borrow<py::dict>(by_level)) {
+    const std::string word = py::str(key), what = fmt::format("constraints['{}']", word);
     if (word == "position") {
-      add(names, ConstraintLevel::position);
+      add(names, what, ConstraintLevel::position);
     } else if (word == "velocity") {
-      add(names, ConstraintLevel::velocity);
+      add(names, what, ConstraintLevel::velocity);
     } else if (word == "acceleration") {
-      add(names, ConstraintLevel::acceleration);
+      add(names, what, ConstraintLevel::acceleration);
     } else {
       throw InputError(fmt::format("constraints: expected 'position', 'velocity' or 'acceleration', got '{}'", word));
     }
@@ -190,11 +196,6 @@ MechanicsSource source_of(const py::object& mechanics, const py::object& constra
   };
 }
 
-void require_function(const py::object& given, const std::string& name) {
-  if (PyCallable_Check(given.ptr()) == 1) return;
-  throw py::type_error(fmt::format("{}: expected a function, got {}", name, std::string(py::str(py::type::of(given)))));
-}
-
 /// {"names": …, "function": …, "derivatives": …, "reads": …} of a latent.
 struct LatentFunction {
   Index n_names = 0;
@@ -204,19 +205,19 @@ struct LatentFunction {
 
   LatentFunction(const py::dict& given, const std::string& what) : function(given["function"]) {
     for (const auto& [key, value] : given) {
-      const auto word = key.cast<std::string>();
+      const std::string word = py::str(key);
       if (word != "names" && word != "function" && word != "derivatives" && word != "reads") {
         throw InputError(fmt::format("{}: expected 'names', 'function', 'derivatives' or 'reads', got '{}'", what, word));
       }
     }
     require_function(given["function"], what);
     if (!given.contains("names")) throw InputError(what + ": missing 'names', one for each number that the function gives");
-    n_names = static_cast<Index>(py::len(given["names"]));
+    n_names = std::ssize(names_argument(given["names"], what + ": names"));
     if (given.contains("derivatives") && !given["derivatives"].is_none()) {
       require_function(given["derivatives"], what + ": derivatives");
       derivatives.emplace(given["derivatives"]);
     }
-    if (given.contains("reads")) reads = given["reads"].cast<std::optional<std::vector<std::string>>>();
+    if (given.contains("reads") && !given["reads"].is_none()) reads = names_argument(given["reads"], what + ": reads");
   }
 };
 
@@ -258,9 +259,10 @@ StateCode directions_code(const LatentFunction& of, const std::string& what, con
   return code;
 }
 
-std::optional<LatentFunction> function_in(const py::handle& given, const std::string& what) {
-  if (!py::isinstance<py::dict>(given) || !given.contains("function")) return std::nullopt;
-  return LatentFunction(given.cast<py::dict>(), what);
+std::optional<LatentFunction> function_in(const py::object& given, const std::string& what) {
+  const py::object parts = as_dict(given);
+  if (!py::isinstance<py::dict>(parts) || !parts.contains("function")) return std::nullopt;
+  return LatentFunction(py::reinterpret_borrow<py::dict>(parts), what);
 }
 
 // what is functions among keywords of System
@@ -269,13 +271,12 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
   if (!kwargs.contains("latents")) return out;
   std::vector<std::string> parameters;
   if (kwargs.contains("parameters") && !kwargs["parameters"].is_none()) {
-    for (const auto& [name, value] : kwargs["parameters"].cast<py::dict>()) parameters.push_back(name.cast<std::string>());
+    for (const auto& [name, value] : py::dict(kwargs["parameters"])) parameters.push_back(py::str(name));
   }
   int number = 0;
   for (const py::handle latent : kwargs["latents"]) {
     ++number;
-    if (!py::isinstance<py::dict>(latent)) continue;
-    const auto given = latent.cast<py::dict>();
+    const py::dict given(py::reinterpret_borrow<py::object>(latent));
     const std::string name = given.contains("name") ? std::string(py::str(given["name"])) : fmt::format("latent {}", number);
     const std::string what = fmt::format("latent '{}'", name);
     ModelCode::OfLatent code;
@@ -286,7 +287,7 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
       }
     }
     if (given.contains("directions")) {
-      py::object directions = given["directions"];
+      py::object directions = as_dict(given["directions"]);
       for (const char* base : {"force", "acceleration"}) {
         if (py::isinstance<py::dict>(directions) && directions.contains(base)) directions = directions[base];
       }
@@ -323,6 +324,11 @@ PySystem from_callables(const py::object& mechanics, const py::object& constrain
 }
 
 }  // namespace
+
+void require_function(const py::object& given, const std::string& name) {
+  if (PyCallable_Check(given.ptr()) == 1) return;
+  throw py::type_error(fmt::format("{}: expected a function, got {}", name, std::string(py::str(py::type::of(given)))));
+}
 
 void add_callables(py::class_<PySystem>& system) {
   using namespace py::literals;

@@ -82,6 +82,10 @@ std::vector<Log> logs_of(const py::object& data, const System& system) {
   return logs;
 }
 
+void require_progress(const py::object& progress) {
+  if (!progress.is_none()) require_function(progress, "progress");
+}
+
 /// What the optimiser said last; it speaks from other threads.
 class LastProgress {
  public:
@@ -112,6 +116,13 @@ std::vector<SideInformation> side_information_of(const py::object& also) {
     out.push_back({quantity_argument(one.view), one.latent, log_of(one.data, one.system, what)});
   }
   return out;
+}
+
+// None, or a function
+py::object take_progress(py::dict& keywords) {
+  const auto progress = take<py::object>(keywords, "progress", py::none());
+  require_progress(progress);
+  return progress;
 }
 
 /// Runs a fit without the interpreter's lock; Ctrl-C ends it with the best so far.
@@ -151,10 +162,14 @@ PyPosterior run(const FitJob& job, const py::object& progress_callback) {
   return std::move(*posterior);
 }
 
+FitJob prepared(FitRequest request) {
+  return unlocked([&] { return prepare_fit(std::move(request)); });
+}
+
 PyPosterior fit_model(const PySystem& system, const py::object& data, const py::kwargs& kwargs) {
   py::dict keywords = kwargs;
   FitRequest request;
-  const auto progress = take<py::object>(keywords, "progress", py::none());
+  const py::object progress = take_progress(keywords);
   const auto also = take<py::object>(keywords, "also", py::tuple());
   const auto commands = take<py::object>(keywords, "commands", py::none());
   read_keywords("fit", keywords, options(request));
@@ -163,50 +178,43 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   request.logs = logs_of(data, system.system());
   request.also = side_information_of(also);
   require_use_of_commands(request);
-  return run(prepare_fit(std::move(request)), progress);
+  return run(prepared(std::move(request)), progress);
 }
 
 py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwargs& kwargs) {
   py::dict keywords = kwargs;
   FitRequest request;
   RawFitOptions raw;
-  const auto progress = take<py::object>(keywords, "progress", py::none());
+  const py::object progress = take_progress(keywords);
   read_keywords("fit_raw", keywords, options(request, raw));
   request.model = *system.model;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  std::atomic<bool> stop = false;
-  std::exception_ptr raised;
-  std::optional<LearnedLog> log;
-  try {
-    log = run_interruptibly([&] { return learn_and_smooth(request, table, raw, &stop); }, stop, raised, [] {});
-  } catch (const Error&) {
-    if (!raised) throw;
-  }
-  if (raised) std::rethrow_exception(raised);
-  py::dict report = report_of(log->data, system.system());
-  std::vector<std::string> notes = log->data.notes;
-  notes.insert(notes.end(), log->notes.begin(), log->notes.end());
+  const LearnedLog log = run_or_raise([&](const std::atomic<bool>* stop) { return learn_and_smooth(request, table, raw, stop); });
+  py::dict report = report_of(log.data, system.system());
+  std::vector<std::string> notes = log.data.notes;
+  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
   tell(notes);
   report["notes"] = notes;
-  report["gains"] = log->gains;
-  CsvTable smoothed = as_table(log->data, system.system(), "smoothed data");
-  request = log->request(std::move(request), "raw data");
-  return py::make_tuple(run(prepare_fit(std::move(request)), progress), std::move(smoothed), std::move(report));
+  report["gains"] = log.gains;
+  CsvTable smoothed = as_table(log.data, system.system(), "smoothed data");
+  request = log.request(std::move(request), "raw data");
+  return py::make_tuple(run(prepared(std::move(request)), progress), std::move(smoothed), std::move(report));
 }
 
 PyPosterior fit_again(const py::object& path, const py::object& data, const py::object& also, const PySystem* system, int threads,
                       const py::object& progress) {
-  const FitFile file = FitFile::read(path_argument(path), code_of(system));
+  require_progress(progress);
+  const FitFile file = read_fit(path, system);
   if (data.is_none()) {
     if (!side_information_of(also).empty()) throw InputError("`again`: `also` goes with `data`");
-    return run(prepare_fit_again(file, threads), progress);
+    return run(unlocked([&] { return prepare_fit_again(file, threads); }), progress);
   }
   FitRequest request = request_of(file);
   request.threads = threads;
   request.data_source.clear();
   request.logs = logs_of(data, *request.model.system);
   request.also = side_information_of(also);
-  return run(prepare_fit(std::move(request)), progress);
+  return run(prepared(std::move(request)), progress);
 }
 
 std::string fit_documentation() {
@@ -220,7 +228,7 @@ std::string fit_documentation() {
 Fit a system to measured accelerations.
 
 data        a path, Table, frame of pandas or polars, structured array or mapping with columns named as the model's (or aliases); or (states, accelerations),
-            arrays (n, len(state_names)) and (n, nq), or frames and mappings with columns of these names; or a list of these and of Log, empty where `also` is all there is. NaN, or None, of an acceleration is "not measured"
+            arrays (n, len(state_names)) and (n, nq), or frames and mappings with columns of these names; or a list of these and of Log, empty where `also` is all there is. NaN, in a table None too, of an acceleration is "not measured"
 commands    where inputs act late and `data` are rows of a longer log: that log, t and inputs, and `episode` where there is one.
             Inputs of tables are commands; those of arrays are what acts
 also        a SideInformation, or a list of them: other quantities, measured or known

@@ -1,4 +1,5 @@
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 #include <pybind11/stl.h>
 
 #include "arrays.hpp"
@@ -45,14 +46,17 @@ py::dict standard_errors(const FitReport& self) {
   return errors;
 }
 
+std::size_t index_of(const FitReport& self, const std::string& name) {
+  std::vector<std::string> names;
+  for (const Hyperparameter& h : self.hyperparameters) {
+    if (h.name == name) return names.size();
+    names.push_back(h.name);
+  }
+  throw py::key_error(fmt::format("no hyperparameter '{}'; there are: {}", name, fmt::join(names, ", ")));
+}
+
 double correlation(const FitReport& self, const std::string& a, const std::string& b) {
-  const auto index = [&](const std::string& name) {
-    for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-      if (self.hyperparameters[k].name == name) return k;
-    }
-    throw py::key_error(name);
-  };
-  return parameter_correlation(self, index(a), index(b));
+  return parameter_correlation(self, index_of(self, a), index_of(self, b));
 }
 
 // name -> what the draws say of a hyperparameter; None where there are none
@@ -70,12 +74,7 @@ py::object draws_of(const FitReport& self) {
   return all;
 }
 
-double value_of(const FitReport& self, const std::string& name) {
-  for (const Hyperparameter& h : self.hyperparameters) {
-    if (h.name == name) return h.value;
-  }
-  throw py::key_error(name);
-}
+double value_of(const FitReport& self, const std::string& name) { return self.hyperparameters[index_of(self, name)].value; }
 
 // As `gp2 fit` prints it, but for the model's units, which a report does not hold.
 std::string text_of(const FitReport& self) {

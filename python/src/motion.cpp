@@ -27,12 +27,7 @@ MotionStart start_argument(const py::object& start, const System& system) {
     const auto values = vector_argument(start, 2 * system.nq(), "start");
     return VectorXd(Eigen::Map<const VectorXd>(values.data(), 2 * system.nq()));
   }
-  try {
-    return start.cast<std::map<std::string, double>>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(
-        fmt::format("start: expected a dict of names to numbers, or all of q and dq, got {}", std::string(py::repr(start))));
-  }
+  return argument<std::map<std::string, double>>(as_dict(start), "start", "a dict of names to numbers, or all of q and dq");
 }
 
 SimulateRequest simulate_request(const System& system, const py::object& start, const py::object& times, const py::object& inputs,
@@ -49,16 +44,10 @@ SimulateRequest simulate_request(const System& system, const py::object& start, 
 /// Motions one after the other; Ctrl-C ends them.
 std::vector<SimulatedMotion> run_motions(const SimulateJob& job) {
   tell(job.notes);
-  std::atomic<bool> stop = false;
-  std::exception_ptr raised;
   std::vector<SimulatedMotion> motions;
-  try {
-    for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
-      motions.push_back({std::move(trajectory)});
-    }
-  } catch (const SimulationStopped&) {
+  for (Trajectory& trajectory : run_or_raise([&](const std::atomic<bool>* stop) { return run_simulation(job, stop); })) {
+    motions.push_back({std::move(trajectory)});
   }
-  if (raised) std::rethrow_exception(raised);
   return motions;
 }
 
@@ -104,12 +93,7 @@ struct PyExcitation {
 
 Limits limits_argument(const py::object& limits, const std::string& name) {
   if (limits.is_none()) return {};
-  try {
-    return limits.cast<Limits>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(
-        fmt::format("{}: expected a dict of names to (lowest, highest), got {}", name, std::string(py::repr(limits))));
-  }
+  return argument<Limits>(as_dict(limits), name, "a dict of names to (lowest, highest)");
 }
 
 PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, double duration, const py::object& inputs_within,
@@ -122,22 +106,13 @@ PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, 
   request.within = limits_argument(within, "within");
   const Posterior posterior = self.posterior;
   const FitSystem driven = system_of(self.file, posterior.prior(), model_of(system));
-  const auto search = [&](const std::atomic<bool>* stop) {
+  PyExcitation out = run_or_raise([&](const std::atomic<bool>* stop) {
     Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, stop);
     MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
     return PyExcitation{found, {{found.motion, std::move(uncertainty)}, driven.model->system}, driven.model->system};
-  };
-  std::atomic<bool> stop = false;
-  std::exception_ptr raised;
-  std::optional<PyExcitation> out;
-  try {
-    out = run_interruptibly([&] { return search(&stop); }, stop, raised, [] {});
-  } catch (const NumericalError&) {
-    if (!raised) throw;
-  }
-  if (raised) std::rethrow_exception(raised);
-  tell(out->found.notes);
-  return std::move(*out);
+  });
+  tell(out.found.notes);
+  return out;
 }
 
 py::dict known_dict(const std::vector<Excitation::Known>& known) {
@@ -183,7 +158,7 @@ void add_motion(py::module_& module) {
             if (!m.uncertainty) return py::none();
             return to_rows(m.uncertainty->stddev);
           },
-          "Of ddq along the motion, as the posterior has it (n, nq); None of a model's own motion.")
+          "Standard deviations of ddq along the motion, as the posterior has it (n, nq); None of a model's own motion.")
       .def_property_readonly(
           "distance_from_data",
           [](const Motion& m) -> py::object {

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <string_view>
-#include <type_traits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -24,22 +23,6 @@ namespace gp2::python {
 
 namespace {
 
-bool is_truth_value(py::handle given) {
-  const std::string_view type = Py_TYPE(given.ptr())->tp_name;
-  return type == "bool" || type == "numpy.bool" || type == "numpy.bool_";
-}
-
-// Python's own conversions take True for the number 1, and any number for true; as an option each is a slip.
-template <typename T>
-T cast(py::handle given, const std::string& name, const std::string& expected) {
-  try {
-    if (std::is_arithmetic_v<T> && std::is_same_v<T, bool> != is_truth_value(given)) throw py::cast_error();
-    return given.cast<T>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(fmt::format("{}: expected {}, got {}", name, expected, std::string(py::repr(given))));
-  }
-}
-
 std::vector<std::string> quoted(std::vector<std::string> words) {
   for (std::string& word : words) word = "'" + word + "'";
   return words;
@@ -52,7 +35,7 @@ std::vector<std::string> words_of(const NumberOrWord& one) {
 }
 
 std::string one_of(py::handle given, const std::vector<std::string>& words, const std::string& name) {
-  const auto word = cast<std::string>(given, name, "a str");
+  const auto word = argument<std::string>(given, name, "a str");
   if (std::find(words.begin(), words.end(), word) == words.end()) {
     throw InputError(fmt::format("{}: expected one of {}, got '{}'", name, fmt::join(quoted(words), ", "), word));
   }
@@ -61,7 +44,7 @@ std::string one_of(py::handle given, const std::vector<std::string>& words, cons
 
 void read_number_or_word(py::handle given, const NumberOrWord& one, const std::string& name) {
   if (!py::isinstance<py::str>(given)) {
-    *one.number = cast<double>(given, name, fmt::format("a positive number, {}", fmt::join(quoted(words_of(one)), " or ")));
+    *one.number = argument<double>(given, name, fmt::format("a positive number, {}", fmt::join(quoted(words_of(one)), " or ")));
     return;
   }
   const std::string word = one_of(given, words_of(one), name);
@@ -69,10 +52,11 @@ void read_number_or_word(py::handle given, const NumberOrWord& one, const std::s
 }
 
 void read_named_numbers(py::handle given, NamedNumbers& numbers, const std::string& name) {
-  if (py::isinstance<py::dict>(given)) {
-    numbers.values = cast<std::map<std::string, double>>(given, name, "numbers by name");
+  const py::object value = as_dict(py::reinterpret_borrow<py::object>(given));
+  if (py::isinstance<py::dict>(value)) {
+    numbers.values = argument<std::map<std::string, double>>(value, name, "numbers by name");
   } else {
-    numbers.file = path_argument(py::reinterpret_borrow<py::object>(given));
+    numbers.file = path_argument(value);
   }
 }
 
@@ -97,39 +81,40 @@ void read_keyword(py::handle given, const Option& option) {
   if (given.is_none() && has_none(option)) return;
   std::visit(
       Overloaded{
-          [&](bool* flag) { *flag = cast<bool>(given, name, "True or False"); },
-          [&](const YesByDefault& one) { *one.value = cast<bool>(given, name, "True or False"); },
+          [&](bool* flag) { *flag = argument<bool>(given, name, "True or False"); },
+          [&](const YesByDefault& one) { *one.value = argument<bool>(given, name, "True or False"); },
           [&](const Switch& one) {
             const bool is_word = py::isinstance<py::str>(given);
-            *one.value = is_word ? one_of(given, {one.on, one.off}, name) == one.on : cast<bool>(given, name, "True or False");
+            *one.value =
+                is_word ? one_of(given, {one.on, one.off}, name) == one.on : argument<bool>(given, name, "True or False");
           },
-          [&](int* value) { *value = cast<int>(given, name, "a whole number"); },
-          [&](std::uint64_t* value) { *value = cast<std::uint64_t>(given, name, "a whole number that is not negative"); },
-          [&](double* value) { *value = cast<double>(given, name, "a number"); },
-          [&](std::string* value) { *value = cast<std::string>(given, name, "a str"); },
-          [&](std::optional<int>* value) { *value = cast<int>(given, name, "a whole number"); },
+          [&](int* value) { *value = argument<int>(given, name, "a whole number"); },
+          [&](std::uint64_t* value) { *value = argument<std::uint64_t>(given, name, "a whole number that is not negative"); },
+          [&](double* value) { *value = argument<double>(given, name, "a number"); },
+          [&](std::string* value) { *value = argument<std::string>(given, name, "a str"); },
+          [&](std::optional<int>* value) { *value = argument<int>(given, name, "a whole number"); },
           [&](std::optional<std::uint64_t>* value) {
-            *value = cast<std::uint64_t>(given, name, "a whole number that is not negative");
+            *value = argument<std::uint64_t>(given, name, "a whole number that is not negative");
           },
-          [&](std::optional<double>* value) { *value = cast<double>(given, name, "a number"); },
-          [&](std::optional<std::string>* value) { *value = cast<std::string>(given, name, "a str"); },
+          [&](std::optional<double>* value) { *value = argument<double>(given, name, "a number"); },
+          [&](std::optional<std::string>* value) { *value = argument<std::string>(given, name, "a str"); },
           [&](std::vector<std::string>* list) {
-            *list = cast<std::vector<std::string>>(given, name, "a list of names");
+            *list = argument<std::vector<std::string>>(given, name, "a list of names");
             if (is_list_with_default(option)) *list = names_or_all(*list, name.c_str());
           },
           [&](std::optional<std::vector<std::string>>* list) {
-            *list = cast<std::vector<std::string>>(given, name, "a list of names");
+            *list = argument<std::vector<std::string>>(given, name, "a list of names");
           },
           [&](std::map<std::string, std::string>* columns) {
             *columns = columns_argument(py::reinterpret_borrow<py::object>(given));
           },
           [&](std::map<std::string, int>* counts) {
-            *counts = cast<std::map<std::string, int>>(given, name, "a dict of names to whole numbers");
+            *counts = argument<std::map<std::string, int>>(given, name, "a dict of names to whole numbers");
           },
           [&](NamedNumbers* numbers) { read_named_numbers(given, *numbers, name); },
           [&](const Choice& one) { one.set(one_of(given, one.words, name)); },
           [&](const NumberOrWord& one) { read_number_or_word(given, one, name); },
-          [&](const Repeated& one) { *one.values = cast<std::vector<std::string>>(given, name, "a list of names"); },
+          [&](const Repeated& one) { *one.values = argument<std::vector<std::string>>(given, name, "a list of names"); },
       },
       option.value);
 }
@@ -242,6 +227,11 @@ std::string value_text(const Option& option, const std::string& value) {
 }
 
 }  // namespace
+
+bool is_truth_value(py::handle given) {
+  const std::string_view type = Py_TYPE(given.ptr())->tp_name;
+  return type == "bool" || type == "numpy.bool" || type == "numpy.bool_";
+}
 
 const std::string& keyword_of(const Option& option) { return option.keyword.empty() ? option.name : option.keyword; }
 

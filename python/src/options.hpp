@@ -1,8 +1,10 @@
 #pragma once
 
 #include <string>
+#include <type_traits>
 #include <vector>
 
+#include <fmt/format.h>
 #include <pybind11/pybind11.h>
 
 #include "gp2/jobs/option.hpp"
@@ -10,6 +12,21 @@
 namespace gp2::python {
 
 namespace py = pybind11;
+
+/// Whether it is Python's truth value, or NumPy's.
+bool is_truth_value(py::handle given);
+
+/// A value as a T. Python's own conversions take True for the number 1, and any number for true; as an argument each is a slip.
+/// @throws py::type_error saying what is expected.
+template <typename T>
+T argument(py::handle given, const std::string& name, const std::string& expected) {
+  try {
+    if (std::is_arithmetic_v<T> && std::is_same_v<T, bool> != is_truth_value(given)) throw py::cast_error();
+    return given.cast<T>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(fmt::format("{}: expected {}, got {}", name, expected, std::string(py::repr(given))));
+  }
+}
 
 /// Takes a keyword that is no option of a job out of `keywords`.
 template <typename T>

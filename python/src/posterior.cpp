@@ -141,8 +141,7 @@ py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArgum
   const Asked asked(self, view_request(arguments), data, columns);
   const Posterior posterior = self.posterior;
   Posterior::Joint result = asked.unlocked_and_named([&] { return posterior.joint(asked.at.view, asked.states.matrix()); });
-  const Index size = result.mean.size();
-  return py::make_tuple(to_vector(std::move(result.mean)), to_rows(std::move(result.covariance.reshaped(size, size))));
+  return py::make_tuple(to_vector(std::move(result.mean)), to_rows(std::move(result.covariance)));
 }
 
 py::array sample(const PyPosterior& self, const py::object& data, int n_samples, std::uint64_t seed,
@@ -234,8 +233,8 @@ Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, c
                               const py::object& columns, int n_threads) {
   const EvaluateRequest request{names_or_all(outputs, "outputs"), model_of(system), columns_argument(columns), n_threads};
   const CsvTable table = to_table(data, "data");
-  const Posterior posterior = self.posterior;
-  EvaluateOutcome outcome = unlocked([&] { return evaluate(self.file, posterior, table, request); });
+  const PyPosterior held = self;
+  EvaluateOutcome outcome = unlocked([&] { return evaluate(held.file, held.posterior, table, request); });
   tell(outcome.notes);
   return std::move(outcome.evaluation);
 }
@@ -309,10 +308,9 @@ void update_with(PyPosterior& self, const py::object& data, const GivenNames& ob
 
 // ---------------------------------------------------------------- files
 
-// what is Python functions in a fit is that of `system`
 PyPosterior load(const py::object& path, const PySystem* system) {
-  FitFile file = FitFile::read(path_argument(path), code_of(system));
-  Posterior posterior = file.posterior();
+  FitFile file = read_fit(path, system);
+  Posterior posterior = unlocked([&] { return file.posterior(); });
   file.observations.clear();
   std::vector<std::string> notes = with_keywords(file.notes.value_or(std::vector<std::string>()));
   return {std::move(file), std::move(posterior), std::move(notes)};
@@ -321,7 +319,8 @@ PyPosterior load(const py::object& path, const PySystem* system) {
 void save(const PyPosterior& self, const py::object& path) {
   FitFile file = self.file;
   file.take_data(self.posterior);
-  file.write(path_argument(path));
+  const std::filesystem::path to = path_argument(path);
+  unlocked([&] { file.write(to); });
 }
 
 // ---------------------------------------------------------------- classes of results
@@ -491,7 +490,7 @@ void define_joint_and_sample(py::class_<PyPosterior>& posterior) {
 void define_potential(py::class_<PyPosterior>& posterior) {
   using namespace py::literals;
   posterior.def("potential", &potential_of, "states"_a, "latent"_a, py::kw_only(), "columns"_a = py::none(),
-                R"(The energy of a latent with directions = "potential", and its deviation: two arrays (n).
+                R"(The energy of a latent with directions = "potential", and its standard deviation: two arrays (n) [J].
 
 It is relative to the first state, for accelerations say nothing of a constant in it.)");
 }
@@ -525,21 +524,27 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
            "velocities, inputs), as gp2 shoot: the posterior under them, and a report (dict) with parameters, the rms of what\n"
            "motions are off in each coordinate before and after, duration, stretches, iterations, converged.")
       .def(
-          "cross_validate", [](const PyPosterior& self) { return cross_validate(self.file, self.posterior); },
-          py::call_guard<py::gil_scoped_release>(),
+          "cross_validate",
+          [](const PyPosterior& self) {
+            const PyPosterior held = self;
+            return unlocked([&] { return cross_validate(held.file, held.posterior); });
+          },
           "How well the data predict themselves: each row from all others, and each of five stretches of time from the rest.")
       .def(
           "fewest_components",
           [](const PyPosterior& self, double largest_error, const std::string& view, const PySystem* system,
              const std::optional<std::string>& latent, const std::optional<double>& dt) {
             const ViewRequest request = view_request({view, system, latent, dt});
-            const py::gil_scoped_release released;
-            const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-            const std::vector<int> few = self.posterior.fewest_components(largest_error, at.view);
-            PyPosterior out{self.file, self.posterior.components(few), {}};
-            std::optional<HyperparameterDraws>& draws = out.file.report.draws;
-            if (draws) draws->values = MatrixXd(draws->values(Eigen::all, few));
-            return out;
+            PyPosterior held = self;
+            unlocked([&] {
+              const PredictedView at = predicted_view(held.file, held.posterior.prior(), request);
+              const std::vector<int> few = held.posterior.fewest_components(largest_error, at.view);
+              held.posterior = held.posterior.components(few);
+              std::optional<HyperparameterDraws>& draws = held.file.report.draws;
+              if (draws) draws->values = MatrixXd(draws->values(Eigen::all, few));
+            });
+            held.notes.clear();
+            return held;
           },
           "largest_error"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(),
           "dt"_a = py::none(),
@@ -560,6 +565,7 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           [](PyPosterior& self, int n) {
             const std::optional<Posterior> kept = kept_by_others(self);
             self.posterior = remove_oldest(std::move(self.posterior), n);
+            if (n > 0) self.file.report.distrusted.clear();  // it counts states from those that are gone
           },
           "n"_a = 1, "Remove the n observed states that were added first, in place.")
       .def(
@@ -576,8 +582,8 @@ std::vector<std::string> export_posterior(const PyPosterior& self, const py::obj
   read_keywords("export", keywords, options(request));
   if (system != nullptr) request.view.system = system->model;
   const std::filesystem::path to = path_argument(folder);
-  const Posterior posterior = self.posterior;
-  const ExportOutcome outcome = unlocked([&] { return export_fit(self.file, posterior, request); });
+  const PyPosterior held = self;
+  const ExportOutcome outcome = unlocked([&] { return export_fit(held.file, held.posterior, request); });
   tell(outcome.notes);
   std::vector<std::pair<std::filesystem::path, std::string>> files;
   std::vector<std::string> written;
@@ -606,6 +612,12 @@ in a folder that exists.
 }
 
 }  // namespace
+
+FitFile read_fit(const py::object& path, const PySystem* system) {
+  const std::filesystem::path from = path_argument(path);
+  const ModelCode code = code_of(system);
+  return unlocked([&] { return FitFile::read(from, code); });
+}
 
 void add_posterior(py::module_& module) {
   // a class comes before the functions that return it, for their signatures to name it

@@ -22,7 +22,8 @@ using Numbers = py::array_t<double, py::array::c_style>;
 Numbers numbers_of(const py::object& given, const std::vector<std::string>& names, const char* what) {
   if (Numbers::check_(given) && !py::hasattr(given, "mask")) {
     auto x = py::reinterpret_borrow<Numbers>(given);
-    if (x.ndim() == 1 && x.shape(0) == std::ssize(names)) return x;
+    const bool is_aligned = (x.flags() & py::detail::npy_api::NPY_ARRAY_ALIGNED_) != 0;
+    if (is_aligned && x.ndim() == 1 && x.shape(0) == std::ssize(names)) return x;
   }
   return vector_argument(given, names, what);
 }

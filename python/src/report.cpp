@@ -34,8 +34,8 @@ Report collected(const py::object& fit, const ReportRequest& request, std::vecto
 // each fit, under the name it has on the page
 std::vector<Report> all_collected(const py::object& fit, const ReportRequest& request, std::vector<std::string>& notes) {
   std::vector<Report> reports;
-  if (py::isinstance<py::dict>(fit)) {
-    for (const auto& [name, one] : fit.cast<py::dict>()) {
+  if (const py::object named = as_dict(fit); py::isinstance<py::dict>(named)) {
+    for (const auto& [name, one] : py::reinterpret_borrow<py::dict>(named)) {
       reports.push_back(collected(py::reinterpret_borrow<py::object>(one), request, notes));
       reports.back().label = py::str(name);
     }
@@ -76,7 +76,7 @@ std::string plot_fit(const py::object& fit, const py::object& path, const py::kw
     const Posterior posterior = self.posterior;
     svg = picture(posterior, self.file.model);
   } else {
-    const FitFile file = FitFile::read(path_argument(fit));
+    const FitFile file = read_fit(fit);
     svg = picture(file.posterior(), file.model);
   }
   if (!path.is_none()) write_file(path_argument(path), svg);
@@ -105,14 +105,14 @@ py::dict compared(const PyPosterior& self, const py::object& data, const PySyste
   request.data = to_table(data, "data");
   request.system = model_of(system);
   request.columns = columns_argument(columns);
-  const Posterior posterior = self.posterior;
+  const PyPosterior held = self;
   std::vector<std::string> notes;
   ReportData found;
   Eigen::VectorXd levels = Eigen::VectorXd::LinSpaced(100, 0, 0.99);
   Eigen::MatrixXd shares;
   {
     const py::gil_scoped_release release;
-    found = compare(self.file, posterior, request, notes);
+    found = compare(held.file, held.posterior, request, notes);
     shares = coverage(found, levels);
   }
   tell(notes);

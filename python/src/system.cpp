@@ -90,7 +90,7 @@ struct Mechanics {
 py::array states_of_table(const PySystem& self, const py::object& data, const py::object& columns, const char* what) {
   const CsvTable table = to_table(data, what);
   LogReader reader = open_log(*self.model, table, columns_argument(columns));
-  return to_rows(read_whole_log(*self.model, reader).states);
+  return to_rows(unlocked([&] { return read_whole_log(*self.model, reader).states; }));
 }
 
 Rows states_of(const PySystem& self, const py::object& states) {
@@ -98,17 +98,20 @@ Rows states_of(const PySystem& self, const py::object& states) {
   return {is_table ? states_of_table(self, states, py::none(), "states") : states, self.system().state_names(), "states"};
 }
 
-Mechanics evaluate(const PySystem& self, const py::object& states, const std::map<std::string, double>& parameters) {
+Mechanics evaluate(const PySystem& self, const py::object& states, const py::object& parameters) {
   const System& system = self.system();
   const Rows rows = states_of(self, states);
-  SystemValues values = system.evaluate(rows.matrix(), parameter_values(system, parameters));
+  const auto given = argument<std::map<std::string, double>>(as_dict(parameters), "parameters", "a dict of names to numbers");
+  SystemValues values = system.evaluate(rows.matrix(), parameter_values(system, given));
   return {to_matrices(values.mass, system.nq(), system.nq()), to_matrices(values.constraint_matrix, system.nc(), system.nq()),
           to_rows(std::move(values.constraint_vector)), to_rows(std::move(values.force))};
 }
 
 CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::optional<double> noise_stddev,
-                        const std::map<std::string, int>& grid) {
-  const GeneratedData data = generate(*self.model, GenerateRequest{n, grid, seed, noise_stddev});
+                        const py::object& grid) {
+  const GenerateRequest request{
+      n, argument<std::map<std::string, int>>(as_dict(grid), "grid", "a dict of names to whole numbers"), seed, noise_stddev};
+  const GeneratedData data = unlocked([&] { return generate(*self.model, request); });
   return as_table(data, self.system(), fmt::format("data of '{}'", self.system().name()));
 }
 
@@ -131,7 +134,7 @@ CsvTable resample_table(const PySystem& self, const py::object& data, int n, con
   read_keywords("resample", keywords, options(asked));
   asked.n = n;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  return table.take(resample(*self.model, table, asked).rows);
+  return unlocked([&] { return table.take(resample(*self.model, table, asked).rows); });
 }
 
 py::tuple derive_table(const PySystem& self, const py::object& data, const py::object& like, const py::kwargs& keywords) {
@@ -164,12 +167,7 @@ const char* word(Finding::Level level) {
 
 std::map<std::string, std::string> columns_argument(const py::object& columns) {
   if (columns.is_none()) return {};
-  try {
-    return columns.cast<std::map<std::string, std::string>>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(
-        fmt::format("columns: expected a dict of the model's names to the log's, got {}", std::string(py::repr(columns))));
-  }
+  return argument<std::map<std::string, std::string>>(as_dict(columns), "columns", "a dict of the model's names to the log's");
 }
 
 View::Quantity quantity_argument(const std::string& given) {
@@ -194,7 +192,9 @@ States::States(const py::object& data, const PredictedView& at, const Eigen::Vec
   const System& system = *at.prior.system;
   if (!is_array(data)) {
     const CsvTable table = to_table(data, "states");
-    LogStates log = read_log_states(at.prior, at.view, *at.model, table, columns_argument(columns), {}, at.actuators, parameters);
+    const std::map<std::string, std::string> names = columns_argument(columns);
+    LogStates log =
+        unlocked([&] { return read_log_states(at.prior, at.view, *at.model, table, names, {}, at.actuators, parameters); });
     tell(log.notes);
     table_ = table.name();
     read_ = std::move(log.states);

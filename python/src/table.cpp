@@ -1,4 +1,5 @@
 #include <cmath>
+#include <filesystem>
 #include <new>
 
 #include <fmt/format.h>
@@ -42,6 +43,11 @@ CsvTable::Column to_column(std::string name, const py::object& values, const std
   return column;
 }
 
+CsvTable read_table(const py::object& path, CsvTable::Keep keep) {
+  const std::filesystem::path from = path_argument(path);
+  return unlocked([&] { return CsvTable::read(from, keep); });
+}
+
 py::array column_of(const CsvTable& table, const std::string& name) {
   const int column = table.find(name);
   if (column < 0) {
@@ -59,7 +65,7 @@ std::string path_argument(const py::object& path) { return py::bytes(py::module_
 CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Keep keep) {
   if (py::isinstance<CsvTable>(data)) return data.cast<CsvTable>();
   const bool is_path = py::isinstance<py::str>(data) || py::hasattr(data, "__fspath__");
-  if (is_path) return CsvTable::read(path_argument(data), keep);
+  if (is_path) return read_table(data, keep);
   const std::optional<py::list> names = column_names(data);
   if (!names) {
     throw py::type_error(
@@ -89,7 +95,9 @@ void add_table(py::module_& module) {
       .def_property_readonly("name", &CsvTable::name, "Stands for the table in messages.")
       .def_property_readonly("columns", &CsvTable::header, "Names of the columns, in their order.")
       .def("keys", &CsvTable::header, "Names of the columns, in their order.")
-      .def("__len__", &CsvTable::n_rows)
+      .def("__len__", &CsvTable::n_rows, "Number of rows.")
+      .def(
+          "__iter__", [](const CsvTable& table) { return py::iter(py::cast(table.header())); }, "Names of the columns.")
       .def("__contains__", [](const CsvTable& table, const std::string& name) { return table.find(name) >= 0; })
       .def("__getitem__", &column_of, py::arg("name"),
            "A column (n,), NaN where the cell is empty.\n\nRaises KeyError when there is none, InputError when a cell is "
@@ -99,7 +107,7 @@ void add_table(py::module_& module) {
         return fmt::format("<gp2.Table '{}': {} rows of {}>", table.name(), table.n_rows(), fmt::join(table.header(), ", "));
       });
   module.def(
-      "read_csv", [](const py::object& path) { return CsvTable::read(path_argument(path)); }, py::arg("path"),
+      "read_csv", [](const py::object& path) { return read_table(path, CsvTable::Keep::text); }, py::arg("path"),
       "Read a CSV file with one header line.\n\nRaises InputError naming file and line: unreadable or empty file, ragged row,\n"
       "repeated or empty column name. Cells are looked at when they are used.");
 }

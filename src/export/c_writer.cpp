@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cctype>
+#include <cmath>
+#include <limits>
 #include <set>
 
 #include <fmt/format.h>
@@ -248,6 +250,9 @@ void Writer::set_sizes() {
 }
 
 std::string Writer::number(double value) const {
+  if (options_.single_precision && std::abs(value) > std::numeric_limits<float>::max()) {
+    throw InputError(fmt::format("the number {} does not fit single precision: leave `float` out", value));
+  }
   std::string text = options_.single_precision ? fmt::format("{}", static_cast<float>(value)) : shortest(value);
   if (text.find_first_of(".e") == std::string::npos) text += ".0";
   return options_.single_precision ? text + "f" : text;

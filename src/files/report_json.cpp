@@ -4,6 +4,7 @@
 #include <map>
 
 #include "files/fit_json.hpp"
+#include "inference/inducing_summary.hpp"
 
 namespace gp2::fit_json {
 
@@ -109,6 +110,18 @@ HyperparameterDraws draws_from(const ParsedJson& json, const std::vector<Hyperpa
   return out;
 }
 
+DistrustedValue distrusted_from(const ParsedJson& json, const std::vector<Observations>& observations, int step) {
+  const DistrustedValue one{integer(json.at("log")), integer(json.at("row")), integer(json.at("state")),
+                            number(json.at("distance")), number(json.at("noise_factor"))};
+  const auto is_below = [](int i, std::ptrdiff_t n) { return i >= 0 && i < n; };
+  if (!is_below(one.group, std::ssize(observations)) ||
+      !is_below(one.row, observations[static_cast<std::size_t>(one.group)].view().size()) ||
+      !is_below(one.state / step, observations[static_cast<std::size_t>(one.group)].n_data()) || one.state < 0) {
+    throw InputError(fmt::format("value {} of state {} of log {} is not among the data", one.row, one.state, one.group));
+  }
+  return one;
+}
+
 }  // namespace
 
 Json report_json(const FitReport& report) {
@@ -123,6 +136,13 @@ Json report_json(const FitReport& report) {
   if (report.uncertainty) json["uncertainty"] = uncertainty_json(*report.uncertainty);
   if (report.draws) json["draws"] = draws_json(*report.draws);
   if (report.inducing) json["inducing"] = inducing_json(*report.inducing);
+  for (const DistrustedValue& one : report.distrusted) {
+    json["distrusted"].push_back({{"log", one.group},
+                                  {"row", one.row},
+                                  {"state", one.state},
+                                  {"distance", one.distance},
+                                  {"noise_factor", one.noise_factor}});
+  }
   return json;
 }
 
@@ -144,6 +164,11 @@ void read_report(const ParsedJson& json, const Prior& prior, const std::vector<O
     if (inducing.contains("summary")) {
       report.inducing->summary = summary_from(inducing.at("summary"), prior, observations, report);
     }
+  }
+  const int step = report.inducing && report.inducing->summary ? report.inducing->summary->kept.step : 1;
+  if (!json.contains("distrusted")) return;
+  for (const ParsedJson& one : array(json.at("distrusted"))) {
+    report.distrusted.push_back(distrusted_from(one, observations, step));
   }
 }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
+#include <limits>
 #include <optional>
 #include <utility>
 
@@ -71,9 +72,14 @@ std::vector<Observations> without_change(const std::vector<Observations>& observ
 
 using Cost = std::function<double(const std::vector<Observations>&)>;
 
+// Infinite where latents that enter nonlinearly have no posterior mean.
 Cost cost_under(const Prior& prior, ModelValues values) {
   return [&prior, values = std::move(values)](const std::vector<Observations>& some) {
-    return Posterior(prior, some, values).negative_log_likelihood();
+    try {
+      return Posterior(prior, some, values).negative_log_likelihood();
+    } catch (const NumericalError&) {
+      return std::numeric_limits<double>::infinity();
+    }
   };
 }
 
@@ -95,13 +101,15 @@ struct InputFactor {
   double gain = 0;  // in log likelihood
 };
 
-// The log likelihood is quadratic in the factor: three values tell where it is largest.
+// The log likelihood is quadratic in the factor, of latents that enter nonlinearly as long as their load hardly changes: three values
+// tell where it is largest.
 InputFactor likeliest_factor(const std::vector<Observations>& observations, const Means& added, double as_logged,
                              const Cost& cost) {
-  const double without = cost(without_change(observations, added, -1)), twice = cost(without_change(observations, added, 1));
-  const double curvature = without - 2 * as_logged + twice;
-  if (!(curvature > 0)) return {};
-  const double step = 0.5 * (without - twice) / curvature;
+  constexpr double h = 0.5;
+  const double less = cost(without_change(observations, added, -h)), more = cost(without_change(observations, added, h));
+  const double curvature = (less - 2 * as_logged + more) / (h * h);
+  if (!(curvature > 0) || std::isinf(curvature)) return {};
+  const double step = 0.5 * (less - more) / (h * curvature);
   return {1 + step, 1 / std::sqrt(curvature), 0.5 * curvature * step * step};
 }
 
@@ -425,6 +433,7 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
   double unexplained_gain = 0;
   for (;;) {
     const double as_logged = cost(observations);
+    if (std::isinf(as_logged)) throw NumericalError("some of the rows have no posterior mean by themselves");
     std::vector<Hypothesis> doubts;
     double gain = least_gain;
     std::ptrdiff_t of_input = -1, of_log = -1;
@@ -484,7 +493,7 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   const auto any = [&](const auto& is) { return std::any_of(all.begin(), all.end(), is); };
   if (prior.reference || n_states(all) < fewest || any([](const auto& group) { return bool(group.view().other_system); })) return;
   const bool of_windows = has_sums(all);
-  const bool asks = !prior.is_nonlinear() && !(of_windows && n_states(all) * system.nq() > 2 * enough);
+  const bool asks = !of_windows || (!prior.is_nonlinear() && n_states(all) * system.nq() <= 2 * enough);
   const bool asks_logs = asks && !of_windows && all.size() > 1 && all.size() <= most_logs;
   const int n_some = enough / system.nq();
   const std::vector<Observations> some = of_windows ? all : evenly(all, n_some);
@@ -498,7 +507,7 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   };
   const Doubted doubted{posterior, some, taken, held, fitted_values};
   std::vector<InputEffect> inputs;
-  bool has_far_values = false, untested = prior.is_nonlinear() && all.size() > 1;
+  bool has_far_values = false;
   for (int j = 0; j < layout.nu && prior.mean == Prior::Mean::force; ++j) {
     const int row = layout.u(j);
     if (!force[static_cast<std::size_t>(row)]) continue;
@@ -509,8 +518,6 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
     } else if (const auto far = far_values_text(system.inputs()[static_cast<std::size_t>(j)], values_of(all, row), lines)) {
       notes.push_back("warning: " + *far);
       has_far_values = true;
-    } else if (prior.is_nonlinear()) {
-      untested = true;
     } else if (asks && !elsewhere[static_cast<std::size_t>(row)] && !is_learned(row)) {
       std::optional<InputEffect> effect = effect_of(doubted, j);
       if (!effect) continue;
@@ -519,11 +526,6 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
       }
       inputs.push_back(*std::move(effect));
     }
-  }
-  if (untested) {
-    notes.emplace_back(
-        "whether inputs act as logged, and whether logs contradict each other, was not tested: a latent enters nonlinearly; "
-        "look at the residuals of the fit");
   }
   // they make all else look wrong
   if (has_far_values) return;

@@ -234,7 +234,8 @@ JudgedData judged_data(const Posterior& posterior, const FitReport& report, cons
   for (std::size_t g = 0; g < judged.observations.size(); ++g) {
     Eigen::MatrixXd values = judged.observations[g].values();
     for (const DistrustedValue& one : report.distrusted) {
-      if (one.group == static_cast<int>(g) && one.state % step == 0) values(one.row, one.state / step) = not_a_number;
+      const bool is_kept = one.group == static_cast<int>(g) && one.state % step == 0 && one.state / step < values.cols();
+      if (is_kept) values(one.row, one.state / step) = not_a_number;
     }
     if (!report.distrusted.empty()) judged.observations[g] = judged.observations[g].with_values(std::move(values));
   }

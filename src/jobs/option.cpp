@@ -125,7 +125,7 @@ std::string options_json(const std::vector<Option>& options) {
     Json value = json_of(option.value);
     if (!value.is_null()) json[option.name] = std::move(value);
   }
-  return json.dump();
+  return json.dump(-1, ' ', false, Json::error_handler_t::replace);  // names of files may be of any encoding
 }
 
 void read_options(const std::string& json, const std::vector<Option>& options, const std::string& source) {

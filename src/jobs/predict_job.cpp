@@ -33,7 +33,7 @@ void set_time_step(View& view, const std::optional<double>& time_step) {
                                 : "`dt` goes with `view=next-velocity`");
   }
   if (!needs_step) return;
-  if (!(*time_step > 0)) throw InputError(fmt::format("`dt`: must be positive, got {}", *time_step));
+  if (!(*time_step > 0) || std::isinf(*time_step)) throw InputError(fmt::format("`dt`: must be positive, got {}", *time_step));
   view.time_step = *time_step;
 }
 

@@ -59,6 +59,10 @@ std::string matrix_text(const Rows& rows, bool full) {
   return out.empty() ? "  (no rows)\n" : out;
 }
 
+std::string text_of(const OrderedJson& json) {
+  return json.dump(2, ' ', false, OrderedJson::error_handler_t::replace) + "\n";  // names of files may be of any encoding
+}
+
 std::string matrix_latex(const char* name, const Rows& rows) {
   std::string out = fmt::format("{} = \\begin{{bmatrix}}\n", name);
   for (std::size_t i = 0; i < rows.size(); ++i) {
@@ -279,7 +283,7 @@ std::vector<Option> options(ShowRequest& request) {
 std::string show(const Model& model, const ShowRequest& request) {
   if (request.latex && request.json) throw InputError("`latex` and `json` are two forms of the same: leave out one");
   const SymbolicSystem& system = require_symbolic_system(model);
-  if (request.json) return model_json(model, system).dump(2) + "\n";
+  if (request.json) return text_of(model_json(model, system));
   return request.latex ? latex_text(Derived(system)) : whole_text(model, system, request.full);
 }
 
@@ -304,7 +308,7 @@ std::string show(const FitFile& fit, const ShowRequest& request, const Spelling&
                  {"hyperparameters", hyperparameters},
                  {"notes", notes},
                  {"options", fit.options.empty() ? OrderedJson() : OrderedJson::parse(fit.options)}};
-  return json.dump(2) + "\n";
+  return text_of(json);
 }
 
 const char* word_of(ConstraintRow::Level level) {

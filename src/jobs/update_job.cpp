@@ -359,6 +359,7 @@ void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& reques
   if (n_old > 0) {
     posterior = remove_oldest(std::move(posterior), static_cast<int>(n_old));
     fit.notes.reset();
+    fit.report.distrusted.clear();  // it counts states from those that are gone
   }
   // logs of which nothing is left
   auto oldest = fit.logs.end();

@@ -120,7 +120,7 @@ void refuse_names_of_other_columns(const ModelReader& reader) {
       refuse(name + "_std", coordinate.name);
     }
     refuse(coordinate.velocity() + "_next", coordinate.name);
-    for (const char* prefix : {"abar_", "fc_"}) refuse(prefix + coordinate.name, coordinate.name);
+    for (const char* prefix : {"abar_", "fc_", "force_"}) refuse(prefix + coordinate.name, coordinate.name);
   }
 }
 

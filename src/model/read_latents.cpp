@@ -64,8 +64,8 @@ void read_features(const ModelReader& reader, const TomlValue& node, LatentSpec&
     }
   };
   if (node.is_table()) {
-    latent.feature_code = code_of(reader, node, latent.name, &ModelCode::OfLatent::features);
     for (const std::string& name : names_of_code(node)) add(node, name, {name});
+    latent.feature_code = code_of(reader, node, latent.name, &ModelCode::OfLatent::features);
   } else {
     for (const TomlValue& entry : node.array()) {
       const Expression value = reader.expression_with_multipliers(entry, "a feature may not depend on accelerations");
@@ -96,8 +96,8 @@ void read_directions(const ModelReader& reader, const TomlValue& node, LatentSpe
     matrix = node.entries().front().second.called(node.key());
   }
   if (matrix.is_table()) {
-    latent.direction_code = code_of(reader, matrix, latent.name, &ModelCode::OfLatent::directions);
     latent.direction_names = names_of_code(matrix);
+    latent.direction_code = code_of(reader, matrix, latent.name, &ModelCode::OfLatent::directions);
     if (latent.direction_names.empty()) matrix.fail("directions that are code need a name for each column");
     return;
   }

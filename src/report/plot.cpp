@@ -68,8 +68,8 @@ std::vector<double> ticks(double low, double high, int n) {
   return all;
 }
 
-std::string number_text(double value) {
-  std::string text = fmt::format("{:.6g}", value);
+std::string number_text(double value, int digits = 6) {
+  std::string text = fmt::format("{:.{}g}", value, digits);
   if (text == "-0") text = "0";
   if (text.starts_with('-')) text.replace(0, 1, "−");
   return text;
@@ -80,10 +80,17 @@ struct Axis {
   double low, high;    // values at the ends
   double first, last;  // pixels there
   [[nodiscard]] double operator()(double value) const { return first + (last - first) * (value - low) / (high - low); }
+  // of its ticks: more than usual where it is far from 0
+  [[nodiscard]] std::string text(double value) const {
+    const double ratio = std::max(std::abs(low), std::abs(high)) / (high - low);
+    return number_text(value, std::max(6, 3 + static_cast<int>(std::ceil(std::log10(ratio)))));
+  }
 };
 
 Axis axis_over(double low, double high, double margin, double first, double last) {
-  const double span = high > low ? high - low : std::max(std::abs(high), 1.0);
+  const double size = std::max(std::abs(low), std::abs(high));
+  // a range of rounding errors has no ticks
+  const double span = high - low > 1e-9 * size ? high - low : size > 0 ? size : 1;
   return {low - margin * span, high + margin * span, first, last};
 }
 
@@ -157,13 +164,13 @@ std::string plot(const LearnedCurve& curve, const Model& model) {
   for (const double value : ticks(up.low, up.high, 6)) {
     svg += fmt::format(
         "<path d=\"M{:.0f},{:.1f}H{:.0f}\" stroke=\"{}\"/><text x=\"{:.0f}\" y=\"{:.1f}\" text-anchor=\"end\">{}</text>\n", left,
-        up(value), right, value == 0 ? "#9aa3a9" : "#e8eaeb", left - 8, up(value) + 4.5, number_text(value));
+        up(value), right, value == 0 ? "#9aa3a9" : "#e8eaeb", left - 8, up(value) + 4.5, up.text(value));
   }
   for (const double value : ticks(across.low, across.high, 7)) {
     svg += fmt::format(
         "<path d=\"M{:.1f},{:.0f}V{:.0f}\" stroke=\"#e8eaeb\"/><text x=\"{:.1f}\" y=\"{:.0f}\" "
         "text-anchor=\"middle\">{}</text>\n",
-        across(value), top, bottom, across(value), bottom + 20, number_text(value));
+        across(value), top, bottom, across(value), bottom + 20, across.text(value));
   }
   // band and mean
   const VectorXd back = force.at.reverse();

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <limits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -31,17 +32,29 @@ constexpr Index max_drawn = 2000;
 // of marks along an axis
 constexpr Index max_ticks = 200;
 
-Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
-
-// for pictures: six digits
-Json rounded(double value) {
-  return std::isfinite(value) ? Json(std::strtod(fmt::format("{:.6g}", value).c_str(), nullptr)) : Json();
+// For pictures: six digits, or more where a row changes little beside its size, as the time since 1970 does.
+template <typename Row>
+int digits_of(const Row& row) {
+  constexpr double infinity = std::numeric_limits<double>::infinity();
+  double low = infinity, high = -infinity;
+  for (Index i = 0; i < row.size(); ++i) {
+    if (!std::isfinite(row[i])) continue;
+    low = std::min(low, row[i]);
+    high = std::max(high, row[i]);
+  }
+  if (!(low < high)) return 6;
+  const double ratio = std::max(std::abs(low), std::abs(high)) / (high - low);
+  return static_cast<int>(std::clamp(6 + std::log10(ratio), 6.0, 17.0));
 }
 
+// What is not finite becomes null, here and wherever a number is written as JSON.
 template <typename Row>
 Json row_json(const Row& row, Index stride = 1) {
+  const int digits = digits_of(row);
   Json array = Json::array();
-  for (Index i = 0; i < row.size(); i += stride) array.push_back(rounded(row[i]));
+  for (Index i = 0; i < row.size(); i += stride) {
+    array.push_back(std::strtod(fmt::format("{:.{}g}", row[i], digits).c_str(), nullptr));
+  }
   return array;
 }
 
@@ -133,7 +146,7 @@ Json observations_json(const FitFile& fit) {
     const std::string latent =
         !group.view().latent ? "" : home.latents[static_cast<std::size_t>(group.view().latent->first)].name;
     Json noise = Json::array();
-    for (const double one : group.usual_noise(values.noise_stddev[g])) noise.push_back(number(one));
+    for (const double one : group.usual_noise(values.noise_stddev[g])) noise.push_back(one);
     groups.push_back({{"names", group.view().names(*prior_of(home, group.view()).system, latent)},
                       {"n", n_states[g]},
                       {"system", g < fit.systems.size() && fit.systems[g] ? fit.systems[g]->system->name() : ""},
@@ -155,7 +168,7 @@ Json parameters_json(const FitFile& fit) {
       row["upper"] = h.upper;
       row["at_bound"] = h.at_bound();
       const double stddev = parameter_uncertainty(fit.report, k).stddev;
-      if (!std::isnan(stddev)) row["stddev"] = std::isinf(stddev) ? Json("not determined") : number(stddev);
+      if (!std::isnan(stddev)) row["stddev"] = std::isinf(stddev) ? Json("not determined") : Json(stddev);
     }
     rows.push_back(row);
   }
@@ -174,7 +187,7 @@ Json hyperparameters_json(const FitReport& report, const Model& model) {
                     {"unit", unit.empty() ? h.unit : unit},
                     {"at_bound", h.at_bound()}});
     const auto own = static_cast<Eigen::Index>(k);
-    if (report.draws) rows.back()["drawn95"] = {number(report.draws->lower[own]), number(report.draws->upper[own])};
+    if (report.draws) rows.back()["drawn95"] = {report.draws->lower[own], report.draws->upper[own]};
   }
   return rows;
 }
@@ -182,8 +195,8 @@ Json hyperparameters_json(const FitReport& report, const Model& model) {
 Json fit_json(const FitReport& report) {
   Json restarts = Json::array();
   for (const RestartReport& one : report.restarts) {
-    restarts.push_back({{"objective", number(one.objective)},
-                        {"nll", number(one.negative_log_likelihood)},
+    restarts.push_back({{"objective", one.objective},
+                        {"nll", one.negative_log_likelihood},
                         {"iterations", one.iterations},
                         {"evaluations", one.evaluations},
                         {"failed", one.failed_evaluations},
@@ -194,8 +207,8 @@ Json fit_json(const FitReport& report) {
   if (report.draws) {
     draws = {{"n", report.draws->size()},
              {"n_chains", report.draws->n_chains},
-             {"r_hat", number(report.draws->r_hat.maxCoeff())},
-             {"effective_size", number(report.draws->effective_size.minCoeff())}};
+             {"r_hat", report.draws->r_hat.maxCoeff()},
+             {"effective_size", report.draws->effective_size.minCoeff()}};
   }
   return {{"draws", draws},
           {"nll", report.negative_log_likelihood},
@@ -212,29 +225,29 @@ Json figures_json(const ReportData& data) {
   const VectorXd truth = data.rmse_to_truth();
   Json rmse = Json::array(), rmse_to_truth = Json::array();
   for (Index k = 0; k < e.rmse.size(); ++k) {
-    rmse.push_back(number(e.rmse[k]));
-    rmse_to_truth.push_back(number(truth[k]));
+    rmse.push_back(e.rmse[k]);
+    rmse_to_truth.push_back(truth[k]);
   }
   return {{"outputs", data.outputs},
           {"rmse", rmse},
           {"rmse_to_truth", rmse_to_truth},
-          {"rmse_normalised", number(e.rmse_normalised)},
-          {"nrmse", number(e.nrmse)},
-          {"max_constraint_error", number(e.max_constraint_error)},
-          {"max_constraint_error_fitted", number(e.max_constraint_error_fitted)},
-          {"nlpd", number(e.nlpd)},
-          {"coverage50", number(e.coverage50)},
-          {"coverage80", number(e.coverage80)},
-          {"coverage95", number(e.coverage95)},
-          {"nlpd_latent", number(e.nlpd_latent)},
-          {"coverage50_latent", number(e.coverage50_latent)},
-          {"coverage80_latent", number(e.coverage80_latent)},
-          {"coverage95_latent", number(e.coverage95_latent)},
+          {"rmse_normalised", e.rmse_normalised},
+          {"nrmse", e.nrmse},
+          {"max_constraint_error", e.max_constraint_error},
+          {"max_constraint_error_fitted", e.max_constraint_error_fitted},
+          {"nlpd", e.nlpd},
+          {"coverage50", e.coverage50},
+          {"coverage80", e.coverage80},
+          {"coverage95", e.coverage95},
+          {"nlpd_latent", e.nlpd_latent},
+          {"coverage50_latent", e.coverage50_latent},
+          {"coverage80_latent", e.coverage80_latent},
+          {"coverage95_latent", e.coverage95_latent},
           {"n_zero_variance", e.n_zero_variance},
           {"n_far", e.far.n},
-          {"nrmse_near", number(e.near.nrmse)},
-          {"nrmse_far", number(e.far.nrmse)},
-          {"coverage95_far", number(e.far.coverage95)},
+          {"nrmse_near", e.near.nrmse},
+          {"nrmse_far", e.far.nrmse},
+          {"coverage95_far", e.far.coverage95},
           {"n", e.n}};
 }
 
@@ -252,9 +265,9 @@ Json rollout_json(const System& system, const Rollout& rollout, const Spelling& 
           {"simulated", rows_json(rollout.simulated)},
           {"stddev", rows_json(rollout.stddev)},
           {"ended", spelled(rollout.ended)},
-          {"leaves", rollout.leaves ? number(*rollout.leaves) : Json()},
+          {"leaves", rollout.leaves ? Json(*rollout.leaves) : Json()},
           {"leaving", rollout.leaving},
-          {"far_from", rollout.far_from ? number(*rollout.far_from) : Json()},
+          {"far_from", rollout.far_from ? Json(*rollout.far_from) : Json()},
           {"multipliers", View::multipliers(system).names(system)},
           {"lambda", rows_json(rollout.multipliers)},
           {"lambda_stddev", rows_json(rollout.multipliers_stddev)},
@@ -292,10 +305,13 @@ Json data_json(const Report& report, const ReportData& data, const Spelling& spe
   const VectorXd levels = nominal_levels();
   Json noise = Json::array();
   // the page draws one band for all measurements of an output
-  for (const auto& row : data.noise_stddev.rowwise()) noise.push_back(number(median({row.begin(), row.end()})));
+  for (const auto& row : data.noise_stddev.rowwise()) noise.push_back(median({row.begin(), row.end()}));
+  const auto errors = data.constraint_error.array();
+  const double largest_error = errors.size() == 0 ? 0 : errors.isNaN().select(0, errors).maxCoeff();
   Json json = {{"name", data.name},
                {"source", data.source},
                {"test", data.is_test},
+               {"other_system", data.is_of_other_system},
                {"n", n},
                {"stride", stride},
                {"outputs", data.outputs},
@@ -310,10 +326,12 @@ Json data_json(const Report& report, const ReportData& data, const Spelling& spe
                {"columns", columns},
                {"measured", rows_json(data.measured, stride)},
                {"predicted", rows_json(data.predicted, stride)},
+               {"residual", rows_json(data.measured - data.predicted(data.rows, Eigen::all), stride)},
                {"stddev", rows_json(data.stddev, stride)},
                {"unconstrained", rows_json(data.unconstrained, stride)},
                {"unconstrained_stddev", rows_json(data.unconstrained_stddev, stride)},
                {"constraint_error", rows_json(data.constraint_error, stride)},
+               {"largest_constraint_error", largest_error},
                {"rollout", rollout_json(system, data.rollout, spelled)}};
   if (data.truth.cols() > 0) json["truth"] = rows_json(data.truth, stride);
   return json;
@@ -326,8 +344,8 @@ Json relevance_json(const std::vector<Relevance>& all) {
                     {"feature", one.feature},
                     {"lengthscale", one.lengthscale},
                     {"spread", one.spread},
-                    {"relevance", number(one.relevance)},
-                    {"effect", one.effect ? number(*one.effect) : Json()}});
+                    {"relevance", one.relevance},
+                    {"effect", one.effect ? Json(*one.effect) : Json()}});
   }
   return rows;
 }

@@ -1,10 +1,13 @@
 #include <array>
 #include <charconv>
+#include <cmath>
+#include <limits>
 #include <set>
 #include <utility>
 
 #include <fmt/format.h>
 
+#include "gp2/error.hpp"
 #include "gp2/symbolic/expression.hpp"
 #include "symbolic/functions.hpp"
 #include "symbolic/graph.hpp"
@@ -77,6 +80,9 @@ std::string Tape::as_c(std::span<const std::string> inputs, std::span<const std:
   const std::set<std::string> taken(inputs.begin(), inputs.end());
   std::vector<CText> slots(n_slots_);
   for (const auto& [slot, value] : constants_) {
+    if (single_precision && std::abs(value) > std::numeric_limits<float>::max()) {
+      throw InputError(fmt::format("the number {} does not fit single precision: leave `float` out", value));
+    }
     std::string digits = single_precision ? digits_of(static_cast<float>(value)) : digits_of(value);
     if (digits.find_first_of(".e") == std::string::npos) digits += ".0";
     slots[slot] = {digits + suffix};

@@ -136,6 +136,11 @@ namespace {
 /// Whether e is written with a leading minus: −u, or a negative constant. Then -e is simpler than e.
 bool has_minus(Expression e) { return e.operation() == Operation::negate || (e.is_constant() && e.constant_value() < 0); }
 
+void require_own(const ExpressionGraph& graph, Expression e) {
+  if (&e.graph() == &graph) return;
+  throw InputError("expressions: the operand belongs to another graph; build all operands in one graph");
+}
+
 /// What `operation` makes of two constants, unless that is infinite or NaN: such a node stays,
 /// so that evaluating it shows the error.
 std::optional<double> fold(Operation operation, double a, double b) {
@@ -231,7 +236,7 @@ Expression ExpressionGraph::variable(std::string_view name) { return {this, impl
 
 Expression ExpressionGraph::apply(Operation operation, Expression a) {
   assert(!is_leaf(operation) && !is_binary(operation));
-  if (a.graph_ != this) throw InputError("expressions: the operand belongs to another graph; build all operands in one graph");
+  require_own(*this, a);
   if (a.is_constant()) {
     if (const auto value = fold(operation, a.constant_value(), 0)) return constant(*value);
   }
@@ -334,10 +339,14 @@ Expression derivative(Expression e, Expression da, Expression db) {
 Expression ExpressionGraph::differentiate(Expression e, Expression x) { return differentiate(std::span(&e, 1), x).front(); }
 
 std::vector<Expression> ExpressionGraph::differentiate(std::span<const Expression> expressions, Expression x) {
+  require_own(*this, x);
   if (x.operation() != Operation::variable) throw InputError("expressions: a derivative is taken with respect to a variable");
   const Expression zero = constant(0);
   std::vector<std::uint32_t> roots;
-  for (const Expression e : expressions) roots.push_back(e.id_);
+  for (const Expression e : expressions) {
+    require_own(*this, e);
+    roots.push_back(e.id_);
+  }
 
   // forwards through the operands, so that depth costs no stack; nodes missing from the map do not depend on x
   std::unordered_map<std::uint32_t, Expression> derivatives{{x.id_, constant(1)}};
@@ -384,6 +393,7 @@ std::vector<Expression> ExpressionGraph::copy(std::span<const Expression> expres
 }
 
 Expression ExpressionGraph::substitute(Expression e, const std::map<std::string, Expression>& replacements) {
+  require_own(*this, e);
   std::unordered_map<std::uint32_t, Expression> results;
   for (const std::uint32_t id : implementation_->reachable(std::array{e.id_})) {
     const Node node = implementation_->nodes[id];
@@ -403,6 +413,7 @@ Expression ExpressionGraph::substitute(Expression e, const std::map<std::string,
 }
 
 std::vector<std::string> ExpressionGraph::variables_of(Expression e) const {
+  require_own(*this, e);
   std::vector<std::string> names;
   for (const std::uint32_t id : implementation_->reachable(std::array{e.id_})) {
     const Node& node = implementation_->nodes[id];
@@ -413,11 +424,13 @@ std::vector<std::string> ExpressionGraph::variables_of(Expression e) const {
 }
 
 bool ExpressionGraph::depends_on(Expression e, Expression x) const {
+  for (const Expression one : {e, x}) require_own(*this, one);
   const std::vector<std::uint32_t> ids = implementation_->reachable(std::array{e.id_});
   return std::binary_search(ids.begin(), ids.end(), x.id_);
 }
 
 ExpressionSize ExpressionGraph::size_of(Expression e) const {
+  require_own(*this, e);
   ExpressionSize size;
   std::unordered_map<std::uint32_t, double> written;
   for (const std::uint32_t id : implementation_->reachable(std::array{e.id_})) {

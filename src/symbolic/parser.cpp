@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <functional>
 #include <numbers>
+#include <numeric>
 #include <optional>
 #include <set>
 #include <utility>
@@ -261,6 +262,7 @@ class Parser {
   /// A symbol that is no single word, such as site("tip").z or point("link7", 0, 0, 0.1).x, resolved by its text with double
   /// quotes and one space after each comma.
   Expression quantity(std::string_view kind, std::size_t start) {
+    const Level level(*this);
     const std::size_t open = position_;
     take();
     const char quote = text_[position_];

@@ -58,7 +58,7 @@ Written write_mathml_number(double value) {
 
 Written write_number(double value, Notation notation) {
   if (notation == Notation::mathml) return write_mathml_number(value);
-  if (notation != Notation::c && std::abs(value) == std::numbers::pi) {
+  if (std::abs(value) == std::numbers::pi) {
     return {{value < 0 ? "-" : "", notation == Notation::latex ? "\\pi" : "pi"}, value < 0 ? in_product : atomic};
   }
   std::string digits = shortest(value);
@@ -68,8 +68,6 @@ Written write_number(double value, Notation notation) {
     const int power_of_ten = std::stoi(digits.substr(exponent + 1));
     digits = fmt::format("{} \\cdot 10^{{{}}}", digits.substr(0, exponent), power_of_ten);
     binding = in_product;
-  } else if (notation == Notation::c && digits.find_first_of(".e") == std::string::npos) {
-    digits += ".0";  // else 1/2 would be a division of integers
   }
   return {{digits}, binding};
 }
@@ -121,7 +119,10 @@ std::string latex_name(std::string_view name) {
   if (parts.n_dots > 0) return fmt::format("\\{}{{{}}}{}", parts.n_dots == 2 ? "ddot" : "dot", *parts.symbol, index);
   if (parts.symbol) return *parts.symbol + index;
   std::string escaped;
-  for (const char c : parts.word) escaped += c == '_' ? std::string("\\_") : std::string(1, c);
+  for (const char c : parts.word) {
+    if (std::string_view("_#%&${}").find(c) != std::string_view::npos) escaped += '\\';
+    escaped += c;
+  }
   return fmt::format("\\mathrm{{{}}}{}", escaped, index);
 }
 
@@ -148,7 +149,7 @@ bool starts_with_number(Expression e) {
   return e.is_constant();
 }
 
-/// Whether e is a·(1/b) with 0 for a = 0. Outside C it is written a/b, which reads back to it where b is a length with component a.
+/// Whether e is a·(1/b) with 0 for a = 0. It is written a/b, which reads back to it where b is a length with component a.
 bool is_quotient_or_zero(Expression e) {
   return e.operation() == Operation::multiply_or_zero && e.right().operation() == Operation::divide &&
          e.right().left().is_constant(1);
@@ -223,7 +224,6 @@ Written write_quotient(Expression a, Expression b, bool in_latex) {
 Written write(Expression e, Notation notation) {
   if (notation == Notation::mathml) return write_mathml(e);
   const bool latex = notation == Notation::latex;
-  const bool c = notation == Notation::c;
   const Operation operation = e.operation();
   switch (operation) {
     case Operation::constant:
@@ -238,29 +238,17 @@ Written write(Expression e, Notation notation) {
     case Operation::negate:
       return {{"-", {e.left(), starts_with_zero(e.left()) ? in_power : in_product}}, in_product};
     case Operation::multiply_or_zero:
-      if (c) {
-        return {{"(", {e.left(), in_sum}, " == 0.0 ? 0.0 : ", {e.left(), in_product}, "*", {e.right(), in_power}, ")"}, atomic};
-      }
       if (is_quotient_or_zero(e)) return write_quotient(e.left(), e.right().right(), latex);
       [[fallthrough]];
     case Operation::multiply: {
       const char* const times = !latex ? "*" : starts_with_number(e.right()) ? " \\cdot " : " \\, ";
-      // c*u*v reads back as c·(u·v), and in LaTeX no one asks which product came first; C computes from the left
-      const bool plain_chain = latex || (!c && e.left().is_constant() && continues_product(e.right()));
+      // c*u*v reads back as c·(u·v), and in LaTeX no one asks which product came first
+      const bool plain_chain = latex || (e.left().is_constant() && continues_product(e.right()));
       return {{{e.left(), in_product}, times, {e.right(), plain_chain ? in_product : in_power}}, in_product};
     }
     case Operation::divide:
       return write_quotient(e.left(), e.right(), latex);
     case Operation::power:
-      if (c) {
-        // as the tape computes it
-        const bool short_base = e.left().operation() == Operation::variable;
-        if (short_base && e.right().is_constant(2)) return {{{e.left(), atomic}, "*", {e.left(), atomic}}, in_product};
-        if (short_base && e.right().is_constant(3)) {
-          return {{{e.left(), atomic}, "*", {e.left(), atomic}, "*", {e.left(), atomic}}, in_product};
-        }
-        return {{"pow(", {e.left(), in_sum}, ", ", {e.right(), in_sum}, ")"}, atomic};
-      }
       if (latex) return {{{e.left(), atomic}, "^{", {e.right(), in_sum}, "}"}, in_power};
       return {{{e.left(), atomic}, "^", {e.right(), in_power}}, in_power};
     case Operation::sqrt:
@@ -269,21 +257,13 @@ Written write(Expression e, Notation notation) {
     case Operation::abs:
       if (latex) return {{"\\left|", {e.left(), in_sum}, "\\right|"}, atomic};
       break;
-    case Operation::sign:
-      // the cast: two signs would be divided as integers
-      if (c) return {{"(double)((", {e.left(), in_sum}, " > 0.0) - (", {e.left(), in_sum}, " < 0.0))"}, atomic};
-      break;
     default:
       break;
   }
 
   // the rest are functions
   const internal::Function& function = *internal::find_function(operation);
-  std::vector<Piece> pieces{std::string(latex ? function.latex
-                                        : c   ? function.c
-                                              : function.text),
-                            latex ? "\\left(" : "(",
-                            {e.left(), in_sum}};
+  std::vector<Piece> pieces{std::string(latex ? function.latex : function.text), latex ? "\\left(" : "(", {e.left(), in_sum}};
   if (internal::is_binary(operation)) {
     pieces.emplace_back(", ");
     pieces.emplace_back(e.right(), in_sum);

@@ -160,6 +160,16 @@ const std::vector<BadInput> bad_inputs = {
      nothing,
      fit_line + " --seed 18446744073709551616",
      {"--seed", "must be below 2^64, got 18446744073709551616"}},
+    {"SeedThatAProgrammerReadsAsOctal", nothing, fit_line + " --seed 010", {"--seed", "expected a whole number, got '010'"}},
+    {"RestartsInOctal", nothing, fit_line + " --restarts 010", {"--restarts", "expected a whole number, at most", "got '010'"}},
+    {"AnInputThatIsAColumnOfACoordinate",
+     [](const Desk& desk) {
+       desk.write("model.toml",
+                  "coordinates = [\"x\"]\ninputs = [\"force_x\"]\n[mechanics]\nmass = [[1]]\nforce = [\"force_x\"]\n");
+     },
+     "gp2 check model.toml",
+     {"model.toml:1: coordinates: the column force_x would be a name of this model and what logs and predictions call a quantity "
+      "of 'x'"}},
     {"GenerateInfiniteNoise",
      nothing,
      "gp2 generate model.toml --n 5 --noise-std inf -o old.csv",

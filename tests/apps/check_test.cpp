@@ -31,6 +31,14 @@ TEST_P(Check, FindsNothingWrongWithAShippedModelAndItsData) {
 
 INSTANTIATE_TEST_SUITE_P(OfEveryModel, Check, testing::ValuesIn(every_model()), model_test_name);
 
+TEST(Check, SpeaksJsonOfALogInLatin1) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 25 -o 'l\xe4ngs.csv'");
+  const Outcome checked = desk.done("gp2 check models/surface.toml --data 'l\xe4ngs.csv' --json");
+  EXPECT_EQ(checked.json()["errors"], 0);
+  EXPECT_THAT(checked.out, HasSubstr("l\uFFFDngs.csv: 25 rows"));
+}
+
 TEST(Check, WarnsOfAccelerationsThatWereComputedFromEachOther) {
   const Desk desk;
   desk.done("gp2 generate models/double_pendulum.toml --n 25 --noise-std 0 -o log.csv");

@@ -115,6 +115,16 @@ TEST(Baseline, StoppedItHasWhatItHasFoundAndWhatFollowsStandsWhereItStarts) {
               1e-9 * std::abs(found.report.negative_log_likelihood));
 }
 
+TEST(Baseline, RefusesAccelerationsInAnotherOrder) {
+  FitProblem p = problem(Baseline::Kind::se);
+  View turned = p.observations.front().view();
+  std::reverse(turned.rows.begin(), turned.rows.end());
+  p.observations.front() = p.observations.front().with_view(turned);
+  const auto refusal = AllOf(HasSubstr("all 3 accelerations in their order"), HasSubstr("rows 2, 1, 0 of 'constrained'"));
+  EXPECT_THAT(test::input_error_of([&] { fit_of(p); }), refusal);
+  EXPECT_THAT(test::input_error_of([&] { standardised_by(p.observations, p.prior, Baseline::Kind::se); }), refusal);
+}
+
 TEST(Baseline, AModelThatHasNoSystemIsRefused) {
   EXPECT_THAT(test::input_error_of([] { unstandardised(Model(), Baseline::Kind::se); }), HasSubstr("there is no system"));
 }

@@ -391,6 +391,14 @@ TEST(FitFile, TellsWhatWasAskedOfTheFit) {
   EXPECT_EQ(written_and_read(fit).options, text);
 }
 
+TEST(FitFile, RefusesToWriteOptionsThatAreNoObject) {
+  FitFile fit = fit_of(unicycle());
+  for (const char* text : {"{", "[1]"}) {
+    fit.options = text;
+    EXPECT_THAT(input_error_of([&] { written_and_read(fit); }), HasSubstr("the options of a fit must be a JSON object")) << text;
+  }
+}
+
 class OldFit : public testing::TestWithParam<int> {};
 INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7, 8, 9, 10));
 

@@ -438,6 +438,17 @@ TEST(Residuals, TellOfAnInputThatActsByItsSquareOrItsLogarithm) {
   EXPECT_THAT(notes_of(notes_of_fit(data), "the input "), testing::ElementsAre(HasSubstr("input w: ")));
 }
 
+TEST(Residuals, AskInputsThatMakeALoad) {
+  for (const std::uint64_t seed : {21U, 22U}) {
+    Data data = test::drawn_log("experiments/mechanisms/rubbing_bead.toml", 80, seed);
+    EXPECT_THAT(notes_of(notes_of_fit(data), "input push"), testing::IsEmpty());
+    data.states.row(data.model->system->layout().u(0)) *= 0.4;
+    EXPECT_THAT(
+        notes_of(notes_of_fit(data), "input push"),
+        testing::ElementsAre(testing::AllOf(HasSubstr("the data deny"), testing::ContainsRegex("acts (1.[89]|2.[0-9]) "))));
+  }
+}
+
 TEST(Residuals, AnEstimatedNoiseDoesNotHideAUnit) {
   const Driven driven;
   const auto notes_with = [&](const Data& data) {
@@ -468,6 +479,11 @@ TEST(Residuals, OfARobustFitLeaveOutWhatItDistrusts) {
   EXPECT_GE(outcome.file.report.distrusted.size(), 2U);
   EXPECT_LT(outcome.cross_validation->one_by_one.nrmse, 0.3);
   EXPECT_EQ(cross_validate(outcome.file, outcome.posterior).one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
+  const std::string path = testing::TempDir() + "robust_fit.json";
+  outcome.file.write(path);
+  const FitFile read = FitFile::read(path);
+  EXPECT_EQ(read.report.distrusted.size(), outcome.file.report.distrusted.size());
+  EXPECT_NEAR(cross_validate(read, read.posterior()).one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse, 1e-9);
   EXPECT_THAT(outcome.notes, Not(Contains(HasSubstr(of_constraint))));
 }
 

@@ -124,11 +124,14 @@ def test_a_prediction_of_the_mean_only_has_no_spread(posterior, arm_states):
 def same_bits(states):
     read_only = states.copy()
     read_only.flags.writeable = False
+    shifted = np.frombuffer(b"x" + states.tobytes(), offset=1).reshape(states.shape)
+    assert not shifted.flags.aligned
     wide = np.zeros((2 * len(states), 2 * states.shape[1]))
     wide[::2, ::2] = states
     return {
         "Fortran order": np.asfortranarray(states),
         "read-only": read_only,
+        "at addresses of no double": shifted,
         "every second of every second": wide[::2, ::2],
         "reversed twice": np.ascontiguousarray(states[::-1, ::-1])[::-1, ::-1],
         "other byte order": states.astype(states.dtype.newbyteorder()),

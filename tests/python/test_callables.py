@@ -1,5 +1,7 @@
 """Systems whose mechanics are Python functions."""
 
+import types
+
 import gp2
 import numpy as np
 import pytest
@@ -191,6 +193,10 @@ def test_what_is_no_system_is_refused(surface):
         as_functions(surface, mass=[["1"]])
     with pytest.raises(gp2.InputError, match="expected 'position', 'velocity' or 'acceleration', got 'loop'"):
         as_functions(surface, constraints={"loop": ["x"]})
+    with pytest.raises(TypeError, match="^constraints: expected a list of names, got 'wire'$"):
+        as_functions(surface, constraints="wire")
+    with pytest.raises(TypeError, match=r"^constraints\['position'\]: expected a list of names, got 3$"):
+        as_functions(surface, constraints={"position": 3})
 
 
 # ---- latents
@@ -285,6 +291,20 @@ def test_functions_of_a_latent_are_refused_where_they_do_not_fit(part, given, te
     log = bead(**TEXT).generate(40, seed=1)
     with pytest.raises(gp2.InputError, match=text):
         gp2.fit(bead(**{**TEXT, part: given}), log, restarts=1, max_iterations=1)
+
+
+def test_functions_of_a_latent_may_be_in_any_mapping():
+    def shown(latent):
+        return gp2.fit(bead(**latent), bead(**TEXT).generate(10, seed=1), max_iterations=0).negative_log_likelihood
+
+    force = types.MappingProxyType({"force": types.MappingProxyType(CODE["directions"]["force"])})
+    assert shown({"features": types.MappingProxyType(CODE["features"]), "directions": force}) == shown(CODE)
+
+
+@pytest.mark.parametrize("key", ["names", "reads"])
+def test_names_of_a_function_are_a_list(key):
+    with pytest.raises(TypeError, match=f"^latent 'contact': features: {key}: expected a list of names, got 'slip'$"):
+        bead(**{**CODE, "features": {**CODE["features"], key: "slip"}})
 
 
 def test_what_is_no_function_is_a_type_error():

@@ -93,6 +93,27 @@ def test_ctrl_c_ends_a_simulation():
     assert seconds < PATIENCE
 
 
+def test_ctrl_c_ends_a_search_that_has_found_no_motion_within_the_limits():
+    out, err, status, seconds = interrupted(
+        """
+        import threading, gp2
+        system = gp2.System(
+            coordinates=["x"], inputs=["u"], mass=[["1"]], force=["u"], latents=[{"features": ["dx"]}], noise=0.1, truth=["0"],
+            sampling={"x": [-1, 1], "dx": [-1, 1], "u": [-1, 1]},
+        )
+        posterior = gp2.fit(system, system.generate(5), mean="force", max_iterations=0)
+        threading.Timer(2, print, ["ready"], {"flush": True}).start()
+        limits = {"inputs_within": {"u": (-1, 1)}, "within": {"x": (-0.5, 0.5)}}
+        try:
+            gp2.excite(posterior, {"x": 0, "dx": 50}, 1, **limits, n_rows=10, n_motions=100_000_000)
+        except KeyboardInterrupt:
+            print("stopped")
+        """
+    )
+    assert (status, out) == (0, "stopped\n"), err
+    assert seconds < PATIENCE
+
+
 def test_ctrl_c_ends_a_large_prediction():
     out, err, status, seconds = interrupted(
         """
@@ -112,8 +133,8 @@ def test_ctrl_c_ends_a_large_prediction():
     assert seconds < PATIENCE
 
 
-def test_other_python_threads_run_during_a_fit(surface):
-    data = surface.generate(250, seed=1)
+def share_of_another_thread(work):
+    """How often another thread got its turn while work() ran, as a share of how often it asked."""
     ticks, done = [], threading.Event()
 
     def tick():
@@ -124,11 +145,31 @@ def test_other_python_threads_run_during_a_fit(surface):
     ticker.start()
     begin = time.monotonic()
     while time.monotonic() - begin < 0.3:  # however fast the machine is
-        gp2.fit(surface, data, restarts=1, max_iterations=40, threads=1)
+        work()
     seconds = time.monotonic() - begin
     done.set()
     ticker.join()
-    assert len([t for t in ticks if begin < t < begin + seconds]) > 0.02 * seconds / 0.005
+    return len([t for t in ticks if begin < t < begin + seconds]) * 0.005 / seconds
+
+
+def test_other_python_threads_run_during_a_fit(surface):
+    data = surface.generate(250, seed=1)
+    assert share_of_another_thread(lambda: gp2.fit(surface, data, restarts=1, max_iterations=40, threads=1)) > 0.02
+
+
+def test_other_python_threads_run_while_files_are_read_and_a_fit_is_prepared(surface, tmp_path):
+    log = surface.generate(700, seed=1)
+    posterior = gp2.fit(surface, log, max_iterations=0, threads=1)
+    posterior.save(tmp_path / "fit.json")
+    rows = np.column_stack([log[name] for name in log])
+    np.savetxt(tmp_path / "log.csv", np.tile(rows, (40, 1)), delimiter=",", header=",".join(log), comments="")
+    for what, work in {
+        "read_csv": lambda: gp2.read_csv(tmp_path / "log.csv"),
+        "load": lambda: gp2.load(tmp_path / "fit.json").negative_log_likelihood,
+        "save": lambda: posterior.save(tmp_path / "again.json"),
+        "resample": lambda: gp2.resample(surface, tmp_path / "log.csv", 50),
+    }.items():
+        assert share_of_another_thread(work) > 0.02, what
 
 
 def test_progress_is_told_while_the_fit_runs(surface):
@@ -154,9 +195,11 @@ def test_what_progress_raises_ends_the_fit_and_carries_the_best_so_far(long_job,
     assert np.isfinite(mean).all()
 
 
-def test_what_is_no_function_is_no_progress(long_job):
-    with pytest.raises(TypeError):
-        long_job(progress=3)
+def test_what_is_no_function_is_no_progress(surface, tmp_path):
+    for call in (lambda: gp2.fit(surface, 3, progress=3), lambda: gp2.fit_raw(surface, 3, progress=3),
+                 lambda: gp2.fit_again(tmp_path, progress=3)):  # before anything is read  # fmt: skip
+        with pytest.raises(TypeError, match="^progress: expected a function, got <class 'int'>$"):
+            call()
 
 
 def test_a_fit_in_a_thread_can_be_stopped_through_its_progress(long_job):

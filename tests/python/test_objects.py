@@ -21,8 +21,9 @@ def test_copy_of_a_posterior_keeps_its_data_when_the_other_grows(posterior, arm)
     assert other.n_data == posterior.n_data + 5
 
 
-def test_system_is_its_own_copy_and_travels_as_text(arm):
-    assert copy.copy(arm) is arm and copy.deepcopy([arm])[0] is arm
+def test_what_never_changes_is_its_own_copy_and_a_system_travels_as_text(arm, arm_log):
+    for fixed in (arm, arm_log, gp2.Log(arm_log, arm), gp2.SideInformation("unconstrained", arm_log)):
+        assert copy.copy(fixed) is fixed and copy.deepcopy([fixed])[0] is fixed
     assert pickle.loads(pickle.dumps(arm)).text == arm.text
 
 

@@ -1,11 +1,13 @@
 """Keywords, stub and pages come from the tables of options of the library."""
 
+import collections
 import re
 import subprocess
 import sys
 import types
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import gp2
@@ -103,6 +105,41 @@ def test_hyperparameters_are_integrated_over(arm, arm_log, tmp_path):
     assert 1 <= len(next(iter(few.report.draws.values()))["values"]) < 25
     assert abs(few.predict(states).mean - posterior.predict(states).mean).max() < posterior.predict(states).std.max()
     assert gp2.fit(arm, arm_log, restarts=1, max_iterations=3).report.draws is None
+
+
+@pytest.mark.parametrize("kind", [types.MappingProxyType, collections.UserDict, pd.Series])
+def test_where_a_dict_is_taken_any_mapping_is(kind, arm, arm_log, posterior):
+    start, times = {"shoulder": 0.9}, [0, 0.1]
+    expected = posterior.simulate(start, times).q
+    np.testing.assert_array_equal(posterior.simulate(kind(start), times).q, expected)
+    np.testing.assert_allclose(gp2.simulate(arm, kind(start), times).q[0], expected[0], rtol=1e-9)
+    states = arm.states(arm_log)
+    np.testing.assert_array_equal(arm.evaluate(states, kind({"m2": 3.0})).M, arm.evaluate(states, {"m2": 3.0}).M)
+    renamed = {{"shoulder": "theta"}.get(name, name): arm_log[name] for name in arm_log}
+    np.testing.assert_array_equal(arm.states(renamed, columns=kind({"shoulder": "theta"})), states)
+    report = gp2.fit(arm, arm_log, max_iterations=0, start=kind({"m2": posterior.parameters["m2"]}), estimate=["m2"]).report
+    assert report["m2"] == posterior.parameters["m2"]
+    if kind is not pd.Series:
+        assert gp2.report(kind({"this": posterior})) == gp2.report({"this": posterior})
+
+
+def test_what_is_no_mapping_of_numbers_is_a_type_error(arm, arm_log, posterior):
+    for call, text in [
+        (lambda: arm.evaluate(arm_log, 3), "^parameters: expected a dict of names to numbers, got 3$"),
+        (lambda: arm.evaluate(arm_log, {"m2": "heavy"}), "^parameters: expected a dict of names to numbers, got {'m2': 'heavy'}$"),
+        (lambda: arm.generate(3, grid={"shoulder": 1.5}), "^grid: expected a dict of names to whole numbers, got"),
+        (lambda: posterior.simulate({"shoulder": None}, [0, 1]), "^start: expected a dict of names to numbers, or all of q and dq, got"),
+    ]:
+        with pytest.raises(TypeError, match=text):
+            call()
+
+
+def test_numbers_and_truth_values_of_numpy_go_into_a_model():
+    keys = {"coordinates": ["q"], "mass": np.array([["m"]], dtype=object)}
+    parameter = {"value": np.float32(0.5), "bounds": np.array([0.25, 1.0]), "estimate": np.True_}
+    system = gp2.System(**keys, parameters={"m": parameter, "g": np.array(9.5), "n": np.int64(2)})
+    assert system.parameters == {"m": 0.5, "g": 9.5, "n": 2}
+    assert "bounds = [0.25, 1.0], estimate = true" in system.text
 
 
 def test_start_may_be_a_dict(arm, arm_log):

@@ -9,6 +9,7 @@ import pytest
 import gp2
 
 pytest.importorskip("matplotlib").use("Agg")
+pyplot = pytest.importorskip("matplotlib.pyplot")
 
 
 def points_of(svg, kind):
@@ -87,6 +88,8 @@ def test_matplotlib_draws_predictions_and_calibration(posterior, arm, arm_log):
     drawn = axes[0].lines[0].get_xydata()
     np.testing.assert_allclose(drawn[:, 0], test["ddshoulder"])
     np.testing.assert_allclose(drawn[:, 1], posterior.predict(test).mean[:, 0])
+    below = pyplot.subplots(2, 1, squeeze=False)[1]
+    assert list(posterior.plot_predictions(test, ax=below)) == list(below[:, 0])
     line = posterior.plot_calibration(test).lines[-1]
     at95 = line.get_ydata()[np.argmin(np.abs(line.get_xdata() - 0.95))]
     assert at95 == pytest.approx(posterior.evaluate(test).coverage95)

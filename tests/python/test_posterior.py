@@ -57,6 +57,7 @@ def test_the_number_of_threads_changes_no_bit(posterior, arm):
 def test_python_threads_predict_at_the_same_time_as_the_data_grow(posterior, arm):
     states = arm.states(arm.generate(200, seed=9))
     before = posterior.predict(states, mean_only=True).mean
+    more = arm.generate(20, seed=10)
     failures = []
 
     def predict():
@@ -64,13 +65,15 @@ def test_python_threads_predict_at_the_same_time_as_the_data_grow(posterior, arm
             for _ in range(20):
                 assert np.isfinite(posterior.predict(states, mean_only=True).mean).all()
                 posterior.joint(states[:5])
+                assert np.isfinite(posterior.evaluate(more, threads=1).nrmse)
+                assert np.isfinite(posterior.cross_validate().one_by_one.nrmse)
+                posterior.fewest_components(0.5)
         except BaseException as error:  # noqa: BLE001  # told by the main thread
             failures.append(error)
 
     threads = [threading.Thread(target=predict) for _ in range(3)]
     for thread in threads:
         thread.start()
-    more = arm.generate(20, seed=10)
     for k in range(20):
         posterior.update({name: values[k : k + 1] for name, values in columns_of(more).items()})
         posterior.remove_oldest()
@@ -180,8 +183,9 @@ def test_the_report_tells_how_the_fit_went(posterior):
     names = [h.name for h in report.hyperparameters]
     assert "m2" in names
     assert report["m2"] == posterior.parameters["m2"]
-    with pytest.raises(KeyError):
-        report["m7"]
+    for ask in (lambda: report["m7"], lambda: report.correlation("m2", "m7")):
+        with pytest.raises(KeyError, match="no hyperparameter 'm7'; there are: .*m2"):
+            ask()
     assert len(report.restarts) == 1
     assert report.termination in repr(report)
     assert all(h.lower <= h.value <= h.upper for h in report.hyperparameters)

@@ -253,6 +253,16 @@ def test_clones_and_pickles_give_the_same_bits(data, model):
     model.predict(X)  # pickling left it as it was
 
 
+def test_parameters_that_are_set_after_a_fit_are_for_the_next(data):
+    X, y = data
+    model = GP2Regressor(WIRE, n_restarts=1, max_iterations=0).fit(X, y)
+    expected, score = model.predict(X), model.score(X, y)
+    model.set_params(system=None, observe=["ddx"])
+    assert np.array_equal(model.predict(X), expected) and model.score(X, y) == score
+    with pytest.raises(ValueError, match="Seed must be between 0 and"):
+        model.set_params(system=WIRE, observe=None, random_state=-1).fit(X, y)
+
+
 def test_systems_of_functions_can_be_cloned_but_not_pickled():
     system = gp2.System.from_callables(
         lambda states, parameters: (np.ones((len(states), 1, 1)), None, None, np.zeros((len(states), 1))),
@@ -303,6 +313,8 @@ def test_every_option_of_fit_reaches_it(data):
     del options["restarts"]
     model = GP2Regressor(WIRE, mean="force", n_restarts=1, fit_options=options)
     assert clone(model).get_params()["fit_options"] == options
+    also = {"also": [gp2.SideInformation("unconstrained", gp2.Table({"x": [0.0]}))]}
+    assert clone(GP2Regressor(WIRE, fit_options=also)).get_params()["fit_options"] == also
     asked = model.fit(X, y).posterior_.options
     assert asked["robust"] is True and asked["hyperparameters"] == "optimise"
     with pytest.raises(TypeError, match="did you mean 'robust'"):

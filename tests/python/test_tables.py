@@ -109,7 +109,7 @@ def test_what_is_known_can_be_learnt_from_alone(arm, frame, arm_states):
 
 def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):
     assert len(arm_log) == 30
-    assert arm_log.keys() == arm_log.columns
+    assert arm_log.keys() == arm_log.columns == list(arm_log) == list(dict(arm_log))
     assert "elbow" in arm_log
     assert "wrist" not in arm_log
     assert arm_log["elbow"].shape == (30,)
@@ -290,6 +290,24 @@ def test_a_table_is_what_has_named_columns(arm, arm_log, arm_fit_file):
         assert sorted(gp2.Table(table).columns) == sorted(columns)
         np.testing.assert_array_equal(posterior.predict(table).mean, expected)
         np.testing.assert_array_equal(arm.states(table), arm.states(columns))
+
+
+class Arrow(Polars):
+    """What a table of Arrow shows of itself: names apart from columns, and an array of all in its own order."""
+
+    column_names = property(lambda self: list(self._columns))
+    columns = property(lambda self: list(self._columns.values()))
+
+    def __array__(self, *_, **__):
+        return np.column_stack(self.columns)
+
+
+def test_a_table_of_arrow_goes_by_name_though_it_is_an_array_too(arm, arm_log, posterior):
+    columns = columns_of(arm_log)
+    backwards = Arrow({name: columns[name] for name in reversed(arm.state_names)})
+    assert gp2.Table(backwards).columns == arm.state_names[::-1]
+    np.testing.assert_array_equal(posterior.predict(backwards).mean, posterior.predict(columns).mean)
+    np.testing.assert_array_equal(arm.evaluate(backwards).A, arm.evaluate(columns).A)
 
 
 def test_what_only_looks_like_a_table_is_none():

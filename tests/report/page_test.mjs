@@ -270,6 +270,22 @@ test("fits side by side are told apart by how far their motions are off", async 
   await close();
 });
 
+test("axes have ticks for a range of rounding errors, and for times since 1970", async () => {
+  const html = readFileSync(join(folder, "surface.html"), "utf8");
+  const place = html.indexOf('id="report">') + 'id="report">'.length, end = html.indexOf("</script>", place);
+  const reports = JSON.parse(html.slice(place, end));
+  const data = reports[0].data[1];
+  data.columns.t = data.predicted[0].map((_, i) => 1.7e9 + i);
+  data.predicted[0] = data.predicted[0].map(() => 100);
+  data.stddev[0] = data.stddev[0].map(() => 1e-14);
+  writeFileSync(join(folder, "narrow.html"), html.slice(0, place) + JSON.stringify(reports).replaceAll("<", "\\u003c") + html.slice(end));
+  const { page, close } = await open("narrow.html");
+  for (const { title, count } of await inked(page)) assert.ok(count > 20, `${title}: ${count} pixels`);
+  await page.locator("#constrained-chart .u-over").hover();
+  assert.match(await page.locator("#constrained-chart .readout").textContent(), /^t \[s\] 17000000\d\d /);
+  await close();
+});
+
 test("the derived constraint is typeset", async () => {
   const { page, close } = await open("surface.html");
   const formulas = await page.locator(".formula math").evaluateAll((all) => all.map((one) => [one.namespaceURI, one.textContent, one.getBoundingClientRect().height]));

@@ -1,5 +1,7 @@
 #include "gp2/report/plot.hpp"
 
+#include <cmath>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -88,6 +90,23 @@ TEST(Plot, IsAPictureOfACurveThatIsFlatAndCertain) {
   const std::string picture = plot(curve, model);
   EXPECT_THAT(picture, testing::AllOf(HasSubstr("a &amp; b"), Not(HasSubstr("nan")), Not(HasSubstr("inf"))));
   EXPECT_THAT(picture, testing::AllOf(HasSubstr(">dx [m/s]<"), HasSubstr(">force_x [N]<")));
+}
+
+TEST(Plot, TellsTicksApartThatLieFarFromZero) {
+  LearnedCurve curve;
+  const double since_1970 = 1.7e9;
+  Eigen::MatrixXd mean = Eigen::MatrixXd::Constant(1, 3, 100);
+  mean(0, 1) = std::nextafter(100, 101);  // no more than rounding
+  curve.force = {"drag",
+                 "t",
+                 {"force_x"},
+                 Eigen::VectorXd::LinSpaced(3, since_1970, since_1970 + 10),
+                 mean,
+                 mean * 0,
+                 Eigen::VectorXd::Constant(2, since_1970)};
+  const Model model = Model::parse("coordinates = ['x']\n[mechanics]\nmass = [['1']]\n", "model.toml");
+  const std::string picture = plot(curve, model);
+  for (const char* tick : {">1700000002<", ">1700000004<", ">100<"}) EXPECT_THAT(picture, HasSubstr(tick));
 }
 
 TEST(Plot, KnowsTheUnitsOfAnglesWithoutBeingTold) {

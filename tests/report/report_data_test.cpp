@@ -148,6 +148,27 @@ TEST_F(ReportOf, HasTheVeryFiguresOfEvaluate) {
   EXPECT_EQ(json["hyperparameters"].size(), desk.json("fit.json")["hyperparameters"].size());
 }
 
+TEST_F(ReportOf, DrawsWhatChangesHoweverFarFromZeroItIs) {
+  Report r = report("surface", "", "--mean force --max-iterations 0", /*with_test=*/false);
+  ReportData& data = r.data[0];
+  constexpr double far = 1e9;
+  const MatrixXd measured = data.measured, residual = data.measured - data.predicted;
+  data.measured.array() += far;
+  data.predicted.array() += far;
+  const auto json = nlohmann::json::parse(report_json({r}, with_flags))[0]["data"][0];
+  for (Eigen::Index k = 0; k < measured.rows(); ++k) {
+    const double range = measured.row(k).maxCoeff() - measured.row(k).minCoeff();
+    const double largest = residual.row(k).cwiseAbs().maxCoeff();
+    for (Eigen::Index i = 0; i < measured.cols(); ++i) {
+      const auto row = static_cast<std::size_t>(k), column = static_cast<std::size_t>(i);
+      EXPECT_NEAR(json["measured"][row][column].get<double>() - far, measured(k, i), 1e-4 * range);
+      EXPECT_NEAR(json["residual"][row][column].get<double>(), residual(k, i), 1e-5 * largest + 1e-15 * far);
+    }
+  }
+  EXPECT_EQ(json["largest_constraint_error"], data.constraint_error.maxCoeff());
+  EXPECT_EQ(json["other_system"], false);
+}
+
 TEST_F(ReportOf, KnowsTheTruthAndTheConstraint) {
   const Report r = report("surface", "--noise-std 0.05", "--mean force");
   for (const ReportData& data : r.data) {

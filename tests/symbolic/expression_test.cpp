@@ -1,5 +1,6 @@
 #include "gp2/symbolic/expression.hpp"
 
+#include <functional>
 #include <limits>
 
 #include <gtest/gtest.h>
@@ -286,8 +287,18 @@ TEST_F(ExpressionTest, GraphsDoNotMix) {
   ExpressionGraph other;
   EXPECT_EQ(test::input_error_of([&] { x + other.variable("x"); }),
             "expressions: the operands belong to different graphs; build all operands in one graph");
-  EXPECT_EQ(test::input_error_of([&] { apply(Operation::sin, other.variable("x")); }),
-            "expressions: the operand belongs to another graph; build all operands in one graph");
+  const Expression foreign = other.variable("x");
+  const std::function<void()> uses[] = {[&] { apply(Operation::sin, foreign); },
+                                        [&] { graph.differentiate(foreign, x); },
+                                        [&] { graph.differentiate(x, foreign); },
+                                        [&] { graph.substitute(foreign, {}); },
+                                        [&] { static_cast<void>(graph.variables_of(foreign)); },
+                                        [&] { static_cast<void>(graph.depends_on(foreign, x)); },
+                                        [&] { static_cast<void>(graph.depends_on(x, foreign)); },
+                                        [&] { static_cast<void>(graph.size_of(foreign)); }};
+  for (const auto& use : uses) {
+    EXPECT_EQ(test::input_error_of(use), "expressions: the operand belongs to another graph; build all operands in one graph");
+  }
 }
 
 TEST_F(ExpressionTest, ACopyReadsAsTheOriginal) {

@@ -254,5 +254,15 @@ TEST(Tape, ErrorsNameTheFault) {
             "tape: make_workspace takes at most the 2 inputs, got 3 shared");
 }
 
+TEST(Tape, RefusesNumbersThatSinglePrecisionLacks) {
+  ExpressionGraph graph;
+  const Expression x = graph.variable("x");
+  const std::vector<std::string> input{"x"}, result{"y"};
+  const Tape tape(std::vector{graph.constant(1e60) * x}, std::vector{x});
+  EXPECT_EQ(tape.as_c(input, result, /*single_precision=*/false), "  y = 1e+60*x;\n");
+  EXPECT_EQ(test::input_error_of([&] { static_cast<void>(tape.as_c(input, result, /*single_precision=*/true)); }),
+            "the number 1e+60 does not fit single precision: leave `float` out");
+}
+
 }  // namespace
 }  // namespace gp2

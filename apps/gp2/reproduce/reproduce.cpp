@@ -37,15 +37,16 @@ constexpr std::array<Experiment, 8> experiments = {{{"table1", reproduce_table1}
 
 // the definitions: as told, beside an installed command, or in the source the command was built from
 std::filesystem::path definitions(const std::string& told) {
+  std::error_code error;  // of a folder that may not be looked into
   if (!told.empty()) {
-    if (!std::filesystem::is_directory(told)) throw InputError(fmt::format("--experiments: there is no folder '{}'", told));
+    if (!std::filesystem::is_directory(told, error))
+      throw InputError(fmt::format("--experiments: there is no folder '{}'", told));
     return told;
   }
-  std::error_code error;
   const std::filesystem::path command = std::filesystem::read_symlink("/proc/self/exe", error);
   for (const std::filesystem::path& folder :
        {command.parent_path() / GP2_EXPERIMENTS_FROM_BIN, std::filesystem::path(GP2_EXPERIMENTS_IN_SOURCE)}) {
-    if (std::filesystem::is_directory(folder)) return folder.lexically_normal();
+    if (std::filesystem::is_directory(folder, error)) return folder.lexically_normal();
   }
   throw InputError("the definitions of the experiments are not where this command was installed: give --experiments DIR");
 }
@@ -55,7 +56,8 @@ void run(const ReproduceArguments& arguments) {
   ReproduceOptions options;
   options.experiments = definitions(arguments.experiments);
   if (!arguments.data.empty()) {
-    if (!std::filesystem::is_directory(arguments.data)) {
+    std::error_code error;
+    if (!std::filesystem::is_directory(arguments.data, error)) {
       throw InputError(fmt::format("--data: there is no folder '{}'", arguments.data));
     }
     options.data = arguments.data;

@@ -1,14 +1,20 @@
 #pragma once
 
+#include <cmath>
 #include <filesystem>
 #include <initializer_list>
 #include <string>
 #include <utility>
 #include <vector>
 
-#include "json.hpp"
+#include <nlohmann/json.hpp>
 
 namespace gp2::command {
+
+/// A number, or null where it is not finite: an empty cell of a table.
+inline nlohmann::ordered_json number_or_null(double value) {
+  return std::isfinite(value) ? nlohmann::ordered_json(value) : nlohmann::ordered_json();
+}
 
 /// A table of results, written as CSV (an empty cell is nothing) and as JSON, a list of objects (null).
 class Table {

@@ -154,11 +154,11 @@ Expression parse_condition(std::string_view text, ExpressionGraph& graph,
                            const std::function<std::optional<Expression>(std::string_view)>& resolve,
                            std::span<const std::string> known_names);
 
-enum class Notation : std::uint8_t { text, latex, c, mathml };
+enum class Notation : std::uint8_t { text, latex, mathml };
 
 /// e written out with no more parentheses than needed; `text` reads back to the same expression. In LaTeX q1 → q_{1}, dq1 →
 /// the same with a dot, ddq1 → with two, greek names → symbols, and so in MathML, where the elements of one `mrow` are given.
-/// multiply_or_zero prints as a product, in C with its guard.
+/// multiply_or_zero prints as a product. For C see Tape::as_c.
 ///
 /// @throws InputError when the text would exceed 16 777 216 characters.
 std::string to_string(Expression e, Notation notation = Notation::text);
@@ -196,6 +196,7 @@ class Tape {
   /// The program as statements of C99, one a line, behind `indent`: they assign the outputs to `results`. What is used once and
   /// short stands where it is used; the rest is called v1, v2, …, or v1_, … where an input is called so. C's functions of double
   /// or, in single precision, of float; sign_of, smaller, larger, product_or_zero, square and integer_power are left to define.
+  /// @throws InputError for a number that single precision cannot hold.
   /// @param inputs   the text for each input: "q1", "parameters[0]"
   /// @param results  what each output is assigned to: "M[0]"
   [[nodiscard]] std::string as_c(std::span<const std::string> inputs, std::span<const std::string> results, bool single_precision,

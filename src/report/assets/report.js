@@ -31,10 +31,14 @@
     return text.includes(".") ? text.replace(/\.?0+$/, "") : text;
   }
   const percent = (share) => (share === null || share === undefined ? missing : `${format(100 * share, 3)} %`);
+  /** Of what is known; NaN where nothing is. */
   const rms = (values) => {
     const known = values.filter((value) => value !== null);
-    return Math.sqrt(known.reduce((sum, value) => sum + value * value, 0) / Math.max(known.length, 1));
+    return Math.sqrt(known.reduce((sum, value) => sum + value * value, 0) / known.length);
   };
+  const apart = (a, b) => rms(a.map((value, i) => (value === null || b[i] === null ? null : value - b[i])));
+  /** Digits that tell values of a range apart: more than 4 where it is far from 0. */
+  const digitsOf = (min, max) => Math.min(15, Math.max(4, 3 + Math.ceil(Math.log10(Math.max(Math.abs(min), Math.abs(max)) / (max - min || 1)))));
 
   // ---- tables -------------------------------------------------------------------------------------------------------------
 
@@ -226,7 +230,9 @@
 
   function padded(min, max, share) {
     if (min === null || max === null || !Number.isFinite(min) || !Number.isFinite(max)) return [0, 1];
-    const pad = max > min ? share * (max - min) : Math.abs(max) * 0.1 || 1;
+    // a range of rounding errors has no ticks
+    const size = Math.max(Math.abs(min), Math.abs(max));
+    const pad = max - min > 1e-9 * size ? share * (max - min) : 0.1 * size || 1;
     return [min - pad, max + pad];
   }
 
@@ -327,9 +333,10 @@
     const both = spec.square ? padded(...data.flat().filter((v) => v !== null).reduce(([low, high], v) => [Math.min(low, v), Math.max(high, v)], [Infinity, -Infinity]), 0.05) : null;
     const width = () => Math.max(plot.clientWidth, 120);
     const height = () => (spec.square ? Math.min(width(), 340) : spec.height || (width() < 480 ? 240 : 280));
-    const axis = (label, extra) => ({
+    const written = (u, scale, value) => format(value, digitsOf(u.scales[scale].min, u.scales[scale].max));
+    const axis = (label, scale, extra) => ({
       label, font, labelFont: font, labelSize: 20, stroke: colour("--muted"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--grid"), width: 1, size: 4 },
-      values: (u, splits) => splits.map((v) => (v === null || v === undefined ? "" : format(v, 4))), ...extra });
+      values: (u, splits) => splits.map((v) => (v === null || v === undefined ? "" : written(u, scale, v))), ...extra });
     const yRange = (u, min, max) => {
       if (both) return both;
       if (spec.y.range) return spec.y.range;
@@ -347,14 +354,15 @@
       legend: { show: false },
       cursor: { drag: { x: true, y: false }, points: { size: 8 } },
       scales: { x: { time: false, range: (u, min, max) => both || spec.x.range || padded(min, max, 0.03) }, y: spec.y.log ? { distr: 3 } : { range: yRange } },
-      axes: [axis(withUnit(spec.x.label), { size: 34 }), axis(withUnit(spec.y.label, spec.y.quantity), spec.y.log ? { size: 50, splits: decades } : { size: 50 })],
+      axes: [axis(withUnit(spec.x.label), "x", { size: 34, space: (u, k, min, max) => Math.max(50, 8 * digitsOf(min, max)) }),
+        axis(withUnit(spec.y.label, spec.y.quantity), "y", { size: (u, labels) => Math.max(50, ...(labels || []).map((text) => 10 + 6 * text.length)), ...(spec.y.log ? { splits: decades } : {}) })],
       hooks: {
         drawAxes: [behind],
         setCursor: [(u) => {
           const i = u.cursor.idx;
           if (i === null || i === undefined) { readout.textContent = ""; return; }
           const parts = u.series.slice(1).map((one, k) => [one.label, u.data[k + 1][i]]).filter(([label, value]) => label && value !== null && value !== undefined);
-          readout.textContent = [`${spec.x.label} ${format(u.data[0][i], 4)}`, ...parts.map(([label, value]) => `${label} ${format(value, 4)}`)].join("  ·  ");
+          readout.textContent = [`${spec.x.label} ${written(u, "x", u.data[0][i])}`, ...parts.map(([label, value]) => `${label} ${written(u, "y", value)}`)].join("  ·  ");
         }],
       },
     };
@@ -425,11 +433,10 @@
     const x = name === "" ? along() : { label: name, values: data.columns[name] };
     const host = keep(byId("residual-charts"), data.outputs.length);
     data.outputs.forEach((output, k) => {
-      const values = data.measured[k].map((value, i) => value === null ? null : value - predictedOutput(k)[i]);
       const noise = data.noise[k];
       chart(host.children[k], {
-        title: output, summary: `rms ${format(rms(values), 3)}${noise === null ? "" : `, fitted noise ${format(noise, 3)}`}`,
-        x, y: { label: "residual", quantity: output, zero: true }, series: [{ label: "residual", values, colour: "--c1", kind: "points" }],
+        title: output, summary: `rms ${format(data.figures.rmse[k], 3)}${noise === null ? "" : `, fitted noise ${format(noise, 3)}`}`,
+        x, y: { label: "residual", quantity: output, zero: true }, series: [{ label: "residual", values: data.residual[k], colour: "--c1", kind: "points" }],
       });
     });
   }
@@ -487,10 +494,9 @@
     if (data.constraint_error.flat().every((value) => value === null)) return note(host, "The data lack what the constraint reads.");
     const x = along();
     const floor = 1e-18;
-    const worst = Math.max(...data.constraint_error.flat());
     const palette = ["--c1", "--c2", "--c3", "--c4"];
     chart(host, {
-      title: `|A q̈ − b|, ${data.name} data`, summary: `At most ${format(worst, 2)}; zeros are drawn at ${floor}.`, x, y: { label: "|A q̈ − b|", log: true },
+      title: `|A q̈ − b|, ${data.name} data`, summary: `At most ${format(data.largest_constraint_error, 2)}; zeros are drawn at ${floor}.`, x, y: { label: "|A q̈ − b|", log: true },
       series: data.constraint_error.map((row, k) => ({ label: `row ${k + 1}`, values: row.map((v) => (v === null ? null : Math.max(v, floor))), colour: palette[k % 4], hollow: k >= 4, kind: "points" })),
     });
   }
@@ -523,14 +529,16 @@
 
   // ---- the motion that the fit makes of the measured start -------------------------------------------------------------------
 
+  const timeOf = (motion, t) => format(t, digitsOf(motion.t[0], motion.t[motion.t.length - 1]));
+
   function rolloutLead(motion) {
     if (motion.reason) return `There is none for the ${data.name} data: ${motion.reason}.`;
     const start = motion.t[0], reached = motion.t[motion.simulated[0].filter((value) => value !== null).length - 1];
-    const within = `within its band, or 5 % of the measured range,`;
+    const within = `within its band, or 5 % of the measured range,`, at = (t) => timeOf(motion, t);
     const parts = [motion.leaves === null
       ? `Over the ${format(reached - start, 4)} s ${motion.ended ? "that it reached" : "shown"} the simulated motion stays with the measured one of the ${data.name} data: ${within} to the end.`
-      : `The simulated motion stays with the measured one of the ${data.name} data ${within} for ${format(motion.leaves - start, 3)} s; ${model.coordinates[motion.leaving]} leaves first, at t = ${format(motion.leaves, 4)}.`];
-    if (motion.far_from !== null) parts.push(`From t = ${format(motion.far_from, 4)} on it is far from the training data.`);
+      : `The simulated motion stays with the measured one of the ${data.name} data ${within} for ${format(motion.leaves - start, 3)} s; ${model.coordinates[motion.leaving]} leaves first, at t = ${at(motion.leaves)}.`];
+    if (motion.far_from !== null) parts.push(`From t = ${at(motion.far_from)} on it is far from the training data.`);
     if (motion.ended) parts.push(`It ended early: ${motion.ended}.`);
     return parts.join(" ");
   }
@@ -548,10 +556,9 @@
     const x = { label: "t [s]", values: motion.t };
     const measured = (values) => ({ label: "measured", values, colour: "--c2", kind: "points", size: 4 });
     const simulated = (values, std) => ({ label: "simulated", values, colour: "--c1", kind: "line", ...(std ? { low: band(values, std, -1), high: band(values, std, 1) } : {}) });
-    const away = (a, b) => format(rms(a.map((value, i) => (value === null || b[i] === null ? null : value - b[i]))), 3);
     keep(hosts[0], model.coordinates.length);
     model.coordinates.forEach((name, j) => chart(hosts[0].children[j], {
-      title: name, summary: `${away(motion.measured[j], motion.simulated[j])} apart (rms), band of ±${format(2 * rms(motion.stddev[j]), 3)} on average`, x, y: { label: name },
+      title: name, summary: `${format(apart(motion.measured[j], motion.simulated[j]), 3)} apart (rms), band of ±${format(2 * rms(motion.stddev[j]), 3)} on average`, x, y: { label: name },
       series: [measured(motion.measured[j]), simulated(motion.simulated[j], motion.stddev[j])],
     }));
     byId("rollout-forces").hidden = !motion.multipliers.length;
@@ -647,7 +654,7 @@
 
     function drawAt(i) {
       slider.value = String(i);
-      clock.textContent = `t = ${format(motion.t[i], 4)} s`;
+      clock.textContent = `t = ${timeOf(motion, motion.t[i])} s`;
       for (const { rows, lines, dots } of bodies) {
         motion.lines.forEach((line, l) => lines[l].setAttribute("d", path(line.map((k) => place(rows, k, i)))));
         dots.forEach((dot, k) => {
@@ -850,8 +857,7 @@
     if (!view) return note(host, "The data hold no coordinate with its velocity.");
     const names = view[2];
     if (names.length === 3) {
-      const whole = report.surface && model.coordinates.length === 3 && !/^training [2-9]/.test(data.name);
-      return drawSpace(host, names, whole ? report.surface : null);
+      return drawSpace(host, names, data.other_system ? null : report.surface);
     }
     const ordered = along().ordered;
     chart(host, {
@@ -863,7 +869,7 @@
   function fillRelevance() {
     const host = byId("relevance-bars");
     if (!report.relevance.length) return note(host, "The kernels have no lengthscales.");
-    const largest = Math.max(...report.relevance.map((one) => one.relevance || 0));
+    const largest = Math.max(...report.relevance.map((one) => one.relevance || 0)) || 1;
     const several = new Set(report.relevance.map((one) => one.latent)).size > 1;
     const rows = [...report.relevance].sort((a, b) => (a.latent === b.latent ? b.relevance - a.relevance : 0));
     const bar = (one) => make("span", { class: "track" }, make("span", { class: "fill", style: `width:${(100 * one.relevance) / largest}%` }));
@@ -921,7 +927,7 @@
     const off = all((one) => {
       const motion = judged(one)?.rollout;
       if (!motion || motion.reason || motion.ended) return null;
-      return rms(motion.measured.map((values, j) => rms(values.map((value, i) => value - motion.simulated[j][i])) / (Math.max(...values) - Math.min(...values) || 1)));
+      return rms(motion.measured.map((values, j) => apart(values, motion.simulated[j]) / (Math.max(...values) - Math.min(...values) || 1)));
     });
     if (off.some((value) => value !== null)) rows.push(["simulated motion, rms error / range", off, low]);
     const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
@@ -941,7 +947,11 @@
   function compareParameters(names) {
     const estimated = [...new Set(reports.flatMap((one) => one.parameters.filter((row) => row.fitted !== undefined).map((row) => row.name)))];
     const host = byId("comparison-parameters");
-    if (!estimated.length) return host.previousElementSibling.remove(), host.remove();
+    if (!estimated.length) {
+      host.previousElementSibling.remove();
+      host.remove();
+      return;
+    }
     const columns = [{ label: "parameter" }, ...names.flatMap((name) => [{ label: name, number: true }, { label: "standard error", number: true }])];
     host.append(table("Estimated parameters of the fits", columns, estimated.map((name) => [withUnit(name), ...reports.flatMap((one) => {
       const row = one.parameters.find((candidate) => candidate.name === name);
@@ -1024,7 +1034,7 @@
 
   function fillControls() {
     const feature = byId("residual-feature");
-    options(feature, [...data.features.filter((name) => data.columns[name]).map((name) => [name, name]), ["", along().label === "row" ? "row of the log" : "time"]], feature.value || data.features[0]);
+    options(feature, [...data.features.filter((name) => data.columns[name]).map((name) => [name, name]), ["", along().label === "row" ? "row of the log" : "time"]], feature.options.length ? feature.value : data.features[0]);
     const against = byId("scatter-against");
     options(against, data.truth ? [["measured", "measured"], ["truth", "true"]] : [["measured", "measured"]], against.value);
     byId("scatter-controls").hidden = !data.truth;
