@@ -105,7 +105,7 @@ def test_ctrl_c_ends_a_search_that_has_found_no_motion_within_the_limits():
         threading.Timer(2, print, ["ready"], {"flush": True}).start()
         limits = {"inputs_within": {"u": (-1, 1)}, "within": {"x": (-0.5, 0.5)}}
         try:
-            gp2.excite(posterior, {"x": 0, "dx": 50}, 1, **limits, n_rows=10, n_motions=100_000_000)
+            gp2.excite(posterior, {"x": 0, "dx": 50}, 1, **limits, n_rows=40, n_motions=100_000_000)
         except KeyboardInterrupt:
             print("stopped")
         """
