@@ -5,6 +5,7 @@
 #include <iterator>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
@@ -185,17 +186,20 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
 void require_accelerations(const Prior& prior, const std::vector<Observations>& observations, const char* function) {
   require_observations(prior, observations);
   require_measured(observations, function);
+  const std::vector<int> all = View::constrained_acceleration(*prior.system).rows;
   for (const Observations& group : observations) {
-    if (group.view().is_of_ddq() && group.view().size() == prior.system->nq()) continue;
-    throw InputError(fmt::format("{}: a baseline learns from all {} accelerations, got observations of {} rows of '{}'", function,
-                                 prior.system->nq(), group.view().size(), group.view().quantity->word()));
+    if (group.view().is_of_ddq() && group.view().rows == all && !group.has_sums()) continue;
+    throw InputError(fmt::format(
+        "{}: a baseline learns from all {} accelerations in their order, got observations of {} '{}'{}", function, all.size(),
+        group.view().rows == all ? "all rows of" : fmt::format("rows {} of", fmt::join(group.view().rows, ", ")),
+        group.view().quantity->word(), group.has_sums() ? " with sums" : ""));
   }
 }
 
 }  // namespace
 
 Baseline standardised_by(const std::vector<Observations>& observations, const Prior& prior, Baseline::Kind kind) {
-  require_measured(observations, "standardised_by");
+  require_accelerations(prior, observations, "standardised_by");
   const MatrixXd features = pooled_features(observations, prior, 0);
   return {kind, row_mean(pooled_values(observations)), features.rowwise().mean(), usable_stddev(features)};
 }

@@ -586,6 +586,10 @@ void CsvWriter::begin_cell() {
 }
 
 void CsvWriter::add(std::string_view cell) {
+  if (cell.find('\n') != std::string_view::npos) {
+    throw InputError(fmt::format("'{}' has a line break in it, but a row of a CSV file is one line here: remove the break",
+                                 shown(std::string(cell))));
+  }
   begin_cell();
   const bool plain =
       cell.find_first_of(",\"") == std::string_view::npos && trim(cell) == cell && !cell.starts_with(byte_order_mark);

@@ -98,7 +98,11 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["report"] = report_json(report);
   if (notes) json["report"]["notes"] = *notes;
   if (!report.actuators.empty()) json["actuators"] = actuators_json(report.actuators);
-  if (!options.empty()) json["options"] = Json::parse(options);
+  if (!options.empty()) {
+    json["options"] = Json::parse(options, nullptr, false);
+    if (!json["options"].is_object())
+      throw InputError(fmt::format("{}: the options of a fit must be a JSON object, got {}", path.string(), options));
+  }
   json["data_source"] = data_source;
   if (!logs.empty()) json["logs"] = logs_json(logs);
   json["observations"] = Json::array();

@@ -20,6 +20,7 @@
 #include "gp2/simulate.hpp"
 #include "jobs/raw_log.hpp"
 #include "smoothing/constrained_states.hpp"
+#include "smoothing/smooth_each.hpp"
 
 namespace gp2 {
 
@@ -88,7 +89,7 @@ SameTimes same_times_of(const std::vector<Measurement>& used) {
   return out;
 }
 
-/// A coordinate of one episode: its report, and its motion at the times that are written.
+/// A coordinate of one episode.
 struct Task {
   int coordinate = 0, episode = 0;
   Channel channel;
@@ -98,9 +99,7 @@ struct Task {
   SameTimes same_times;
   Eigen::Matrix3Xd course;                  // the learned motion that the fit is about; empty: the mean
   double gain = 0;                          // by it, in log likelihood
-  std::vector<Eigen::Matrix3d> covariance;  // of the motion smoothed without it
-  SmoothedMotion motion;                    // its covariances only where constraints are held
-  Eigen::Matrix3Xd stddev;
+  std::vector<Eigen::Matrix3d> covariance;  // of the motion smoothed without it; then of the motion, where constraints are held
 };
 
 class Deriver {
@@ -114,8 +113,9 @@ class Deriver {
 
   DerivedData run() {
     fit_channels();
+    lay_out_rows();
     smooth_channels();
-    collect_rows();
+    keep_columns();
     add_inputs();
     const MatrixXd commands = data_.states.bottomRows(system_.layout().nu);
     let_inputs_act();
@@ -208,12 +208,13 @@ class Deriver {
       own.outlier_threshold = options_.outlier_threshold;
       own.least_noise_stddev = task.channel.resolution / std::sqrt(12.0);  // of rounding
       if (options_.like) own.model = models_.at(task.coordinate);
-      task.fit = fit_smoother(task.channel.measurements, own);
+      std::vector<Measurement>& measurements = task.channel.measurements;
+      task.fit = fit_smoother(learned_ ? measurements : std::move(measurements), own);
       task.model = task.fit.model;
       task.kurtosis = task.fit.kurtosis;
       task.same_times = same_times_of(task.fit.trusted);
       if (learned_ && !is_short(task)) take_learned(task, own);
-      release(task.channel.measurements);  // a long log is told once
+      release(measurements);  // a long log is told once
       tell_progress();
     });
   }
@@ -231,24 +232,39 @@ class Deriver {
     parallel_for(static_cast<int>(tasks_.size()), thread_count(options_.n_threads), [&](int k, int) {
       Task& task = tasks_[static_cast<std::size_t>(k)];
       const VectorXd times = times_to_write(episode_of(task.episode));
-      task.motion = smooth(task.fit.model, task.fit.trusted, times);
-      task.motion.mean.row(0).array() += task.channel.mean;
-      if (task.course.size() > 0) {
-        task.motion.mean += task.course;
-        task.motion.covariance = std::move(task.covariance);
-      }
-      task.stddev.resize(3, times.size());
-      for (Index i = 0; i < times.size(); ++i)
-        task.stddev.col(i) = task.motion.covariance[static_cast<std::size_t>(i)].diagonal().cwiseMax(0).cwiseSqrt();
-      if (!options_.hold_constraints) release(task.motion.covariance);
+      write_motion(task, times);
       DerivedSeries& series = data_.series[static_cast<std::size_t>(k)];
       series = report_of(task, shared[static_cast<std::size_t>(k)]);
       series.start = episode_of(task.episode).start;
       if (options_.keep_positions) series.positions = positions_of(task, times);
       release(task.fit.trusted);
+      task.course.resize(3, 0);
       tell_progress();
     });
     if (!warn_of_a_coarse_clock()) warn_of_fast_motions();
+  }
+
+  /// Writes the motion of a series, and its deviations, into the rows of its episode.
+  void write_motion(Task& task, const VectorXd& times) {
+    const StateLayout layout = system_.layout();
+    const int j = task.coordinate;
+    const Index first = first_row_[static_cast<std::size_t>(task.episode)];
+    const bool has_course = task.course.size() > 0;
+    task.covariance.resize(has_course || options_.hold_constraints ? static_cast<std::size_t>(times.size()) : 0);
+    smooth_each(task.fit.model, task.fit.trusted, times,
+                [&](Index i, const Eigen::Vector3d& smoothed, const Eigen::Matrix3d& covariance) {
+                  Eigen::Vector3d motion = smoothed;
+                  motion[0] += task.channel.mean;
+                  if (has_course) motion += task.course.col(i);
+                  data_.states(layout.q(j), first + i) = motion[0];
+                  data_.states(layout.dq(j), first + i) = motion[1];
+                  data_.accelerations(j, first + i) = motion[2];
+                  if (options_.hold_constraints && !has_course) task.covariance[static_cast<std::size_t>(i)] = covariance;
+                  const Eigen::Matrix3d& without_course = has_course ? task.covariance[static_cast<std::size_t>(i)] : covariance;
+                  for (int d = 0; d < 3; ++d)
+                    data_.stddev(d * layout.nq + j, first + i) = std::sqrt(std::max(0.0, without_course(d, d)));
+                });
+    if (!options_.hold_constraints) release(task.covariance);
   }
 
   // whether there is one; samples of one time that lie apart by the motion's speed are no noise
@@ -423,7 +439,7 @@ class Deriver {
   }
 
   // rows of all episodes, one after another
-  void collect_rows() {
+  void lay_out_rows() {
     std::vector<double> times;
     for (int e = 0; e < std::ssize(episodes_); ++e) {
       first_row_.push_back(static_cast<Index>(times.size()));
@@ -438,14 +454,9 @@ class Deriver {
     data_.accelerations = MatrixXd::Constant(layout.nq, n, not_a_number);
     data_.stddev = MatrixXd::Constant(3 * Index{layout.nq}, n, not_a_number);
     data_.states.row(layout.t()) = Eigen::Map<const VectorXd>(times.data(), n).transpose();
-    for (const Task& task : tasks_) {
-      const Index first = first_row_[static_cast<std::size_t>(task.episode)];
-      for (Index i = 0; i < task.motion.mean.cols(); ++i) {
-        data_.states(layout.q(task.coordinate), first + i) = task.motion.mean(0, i);
-        data_.states(layout.dq(task.coordinate), first + i) = task.motion.mean(1, i);
-        data_.accelerations(task.coordinate, first + i) = task.motion.mean(2, i);
-      }
-    }
+  }
+
+  void keep_columns() {
     for (const std::string& name : options_.keep) {
       data_.kept_names.push_back(name);
       std::vector<std::string>& cells = data_.kept.emplace_back();
@@ -472,9 +483,11 @@ class Deriver {
         }
         const Channel channel = raw_.input(u, episode);
         const VectorXd times = times_to_write(episode);
-        const SmoothedMotion motion = smooth(slowest->model, channel.measurements, times);
-        data_.states.row(system_.layout().u(static_cast<int>(u))).segment(first_row_[static_cast<std::size_t>(e)], times.size()) =
-            motion.mean.row(0).array() + channel.mean;
+        const Index first = first_row_[static_cast<std::size_t>(e)];
+        smooth_each(slowest->model, channel.measurements, times,
+                    [&](Index i, const Eigen::Vector3d& motion, const Eigen::Matrix3d&) {
+                      data_.states(system_.layout().u(static_cast<int>(u)), first + i) = motion[0] + channel.mean;
+                    });
       }
     }
   }
@@ -609,11 +622,11 @@ class Deriver {
     const Index nq = system_.nq();
     MatrixXd stddev = MatrixXd::Zero(2 * nq, data_.states.cols());
     for (const Task& task : tasks_) {
-      const Index first = first_row_[static_cast<std::size_t>(task.episode)];
-      for (int d = 0; d < 2; ++d) {
-        const Eigen::RowVectorXd course = task.motion.mean.row(d);
+      const Index first = first_row_[static_cast<std::size_t>(task.episode)], n = last_row(task.episode) - first;
+      for (const Index row : {Index{task.coordinate}, nq + task.coordinate}) {  // q, dq stand first in a state too
+        const Eigen::RowVectorXd course = data_.states.row(row).segment(first, n);
         const double spread = std::sqrt((course.array() - course.mean()).square().mean());
-        stddev.row(d * nq + task.coordinate).segment(first, course.size()) = task.stddev.row(d).cwiseMax(rounding * spread);
+        stddev.row(row).segment(first, n) = data_.stddev.row(row).segment(first, n).cwiseMax(rounding * spread);
       }
     }
     return stddev;
@@ -684,30 +697,36 @@ class Deriver {
     }
     for (Index i = first; i < last; ++i) {
       VectorXd state = started(i, from);
-      std::vector<Eigen::Matrix3d> covariance;
       if (conditioned) {
-        for (const Task* task : tasks) covariance.push_back(task->motion.covariance[static_cast<std::size_t>(i - first)]);
-        states.condition(state, data_.accelerations.col(i), covariance);
+        hold_constraints(states, tasks, i, i - first, state);
       } else {
         states.complete(state, data_.accelerations.col(i));
       }
       data_.states.col(i) = state;
       from = state.head(2 * layout.nq);
-      for (std::size_t k = 0; k < tasks.size(); ++k) {
-        const Eigen::Vector3d stddev =
-            conditioned ? covariance[k].diagonal().cwiseMax(0).cwiseSqrt().eval() : tasks[k]->stddev.col(i - first).eval();
-        for (int d = 0; d < 3; ++d) data_.stddev(d * layout.nq + tasks[k]->coordinate, i) = stddev[d];
-      }
-      // once the constraints hold some accelerations say all others: which may change along the motion
-      if (!conditioned) continue;
-      VectorXd stddev(static_cast<Index>(data_.measured.size()));
-      for (Index k = 0; k < stddev.size(); ++k) {
-        stddev[k] = std::max(data_.stddev(2 * layout.nq + data_.measured[static_cast<std::size_t>(k)], i),
-                             std::numeric_limits<double>::min());
-      }
-      data_.is_independent.col(i) = false;
-      for (const int j : states.independent_accelerations(state, stddev)) data_.is_independent(j, i) = true;
     }
+  }
+
+  /// @param tasks  of the episode
+  /// @param row, row_of_episode  the same, among all rows and among those of the episode
+  void hold_constraints(const ConstrainedStates& states, const std::vector<const Task*>& tasks, Index row, Index row_of_episode,
+                        VectorXd& state) {
+    const Index nq = system_.nq();
+    std::vector<Eigen::Matrix3d> covariance;
+    for (const Task* task : tasks) covariance.push_back(task->covariance[static_cast<std::size_t>(row_of_episode)]);
+    states.condition(state, data_.accelerations.col(row), covariance);
+    for (std::size_t k = 0; k < tasks.size(); ++k) {
+      const Eigen::Vector3d stddev = covariance[k].diagonal().cwiseMax(0).cwiseSqrt();
+      for (int d = 0; d < 3; ++d) data_.stddev(d * nq + tasks[k]->coordinate, row) = stddev[d];
+    }
+    // some accelerations say all others now: which may change along the motion
+    VectorXd stddev(static_cast<Index>(data_.measured.size()));
+    for (Index k = 0; k < stddev.size(); ++k) {
+      stddev[k] =
+          std::max(data_.stddev(2 * nq + data_.measured[static_cast<std::size_t>(k)], row), std::numeric_limits<double>::min());
+    }
+    data_.is_independent.col(row) = false;
+    for (const int j : states.independent_accelerations(state, stddev)) data_.is_independent(j, row) = true;
   }
 
   // a first row that is solved as well as it can be, to look at
@@ -794,28 +813,31 @@ CsvTable as_table(const DerivedData& data, const System& system, std::string nam
   const StateLayout layout = system.layout();
   const std::vector<std::string> state_names = system.state_names(), acceleration_names = system.acceleration_names();
   std::vector<CsvTable::Column> columns;
-  const auto add = [&](const std::string& column, const MatrixXd& values, Index row) {
-    columns.push_back({column, {values.row(row).begin(), values.row(row).end()}});
+  const auto add = [&](const std::string& column, const auto& values) {
+    columns.push_back({column, {values.begin(), values.end()}});
   };
-  const auto add_known = [&](const std::string& column, const MatrixXd& values, Index row) {
-    if (!values.row(row).array().isNaN().any()) add(column, values, row);
+  const auto add_known = [&](const std::string& column, const auto& values) {
+    if (!values.array().isNaN().any()) add(column, values);
   };
   if (!data.episode_column.empty()) {
     std::vector<std::string>& labels = columns.emplace_back(CsvTable::Column{data.episode_column, {}}).cells;
     for (const int episode : data.episode) labels.push_back(data.episodes[static_cast<std::size_t>(episode)]);
   }
-  add("t", data.states, layout.t());
-  for (int k = 0; k < layout.t(); ++k) add_known(state_names[static_cast<std::size_t>(k)], data.states, k);
-  for (int k = layout.u(0); k < layout.size(); ++k) add_known(state_names[static_cast<std::size_t>(k)], data.states, k);
-  for (int j = 0; j < layout.nq; ++j) add_known(acceleration_names[static_cast<std::size_t>(j)], data.accelerations, j);
+  add("t", data.states.row(layout.t()));
+  for (int k = 0; k < layout.t(); ++k) add_known(state_names[static_cast<std::size_t>(k)], data.states.row(k));
+  for (int k = layout.u(0); k < layout.size(); ++k) add_known(state_names[static_cast<std::size_t>(k)], data.states.row(k));
+  for (int j = 0; j < layout.nq; ++j) add_known(acceleration_names[static_cast<std::size_t>(j)], data.accelerations.row(j));
   for (int d = 0; d < 2; ++d) {
     for (const int j : data.measured) {
       const int row = d * layout.nq + j;
-      add(state_names[static_cast<std::size_t>(row)] + "_std", data.stddev, row);
+      add(state_names[static_cast<std::size_t>(row)] + "_std", data.stddev.row(row));
     }
   }
-  const MatrixXd of_independent = data.is_independent.select(data.stddev.bottomRows(layout.nq), not_a_number);
-  for (const int j : data.independent) add(acceleration_names[static_cast<std::size_t>(j)] + "_std", of_independent, j);
+  for (const int j : data.independent) {
+    const Eigen::RowVectorXd of_independent =
+        data.is_independent.row(j).matrix().select(data.stddev.row(2 * Index{layout.nq} + j), not_a_number);
+    add(acceleration_names[static_cast<std::size_t>(j)] + "_std", of_independent);
+  }
   for (std::size_t k = 0; k < data.kept.size(); ++k) columns.push_back({data.kept_names[k], {}, data.kept[k]});
   return CsvTable::from_columns(std::move(name), std::move(columns));
 }

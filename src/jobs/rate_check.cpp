@@ -166,6 +166,20 @@ bool is_scaled(const Steps& steps) {
   return std::abs(s - 1) > std::max(least, by_chance) + 2 * (of_noise + of_trapezoids);
 }
 
+// By how much a rate is too large throughout: y = x − o h. Nothing where that does not make it the right one, does not stand out of its
+// deviation, or is less than a tenth of the rate.
+std::optional<double> offset(const Steps& steps) {
+  if (steps.n() < enough_steps) return std::nullopt;
+  const double time = steps.h.sum(), o = (steps.x - steps.y).sum() / time;
+  Steps without = steps;
+  without.x -= o * steps.h;
+  if (!without.tell(1) || !(without.correlation() > surely_correlated) || is_scaled(without)) return std::nullopt;
+  const double usual = std::sqrt(without.x.square().sum() / steps.h.square().sum());
+  if (!(std::abs(o) > std::max(worth_a_word * usual, surely_apart * deviation((without.y - without.x) / time))))
+    return std::nullopt;
+  return o;
+}
+
 }  // namespace
 
 std::string better_rate(const RateColumns& columns) {
@@ -175,8 +189,27 @@ std::string better_rate(const RateColumns& columns) {
   Index length = 1;
   while (columns.t.size() > 2 * length * enough_steps && rows.steps(own, 0, 2 * length).tell(0.5)) length *= 2;
   const Steps now = rows.steps(own, 0, length);
+  if (const std::optional<double> o = offset(now)) {
+    return fmt::format("what is measured lies {:.3g} {} it throughout: the zero of a sensor, or gravity that it feels",
+                       std::abs(*o), *o > 0 ? "above" : "below");
+  }
   if (!now.tell(1)) return "";
   const auto is_sure = [](const Steps& steps) { return steps.tell(1) && std::abs(steps.correlation()) > surely_correlated; };
+  const auto other_column = [&](const auto& is_better) -> std::string {
+    for (std::size_t other = 0; other < columns.rates.size(); ++other) {
+      if (other == own || columns.rates[other].hasNaN()) continue;
+      const Steps steps = rows.steps(other, 0, length);
+      if (is_sure(steps) && is_better(steps))
+        return fmt::format("it is measured by the column of {}: swapped?", columns.names[other]);
+    }
+    return "";
+  };
+  // of coordinates that move together a wrong column goes along, and noise may hide the right one: the other must be the rate itself
+  const auto unexplained = [](const Steps& steps) { return 1 - std::pow(steps.correlation(), 2); };
+  const std::string swapped = other_column([&](const Steps& steps) {
+    return std::abs(steps.slope() - 1) < 0.1 && std::abs(now.slope() - 1) > 0.1 && unexplained(now) > 10 * unexplained(steps);
+  });
+  if (!swapped.empty()) return swapped;
   std::optional<Index> lag;
   if (is_sure(now)) lag = 0;
   double best = 1 - 0.1 * (1 - now.correlation());
@@ -200,13 +233,7 @@ std::string better_rate(const RateColumns& columns) {
     }
     return fmt::format("{}", fmt::join(texts, "; "));
   }
-  for (std::size_t other = 0; other < columns.rates.size(); ++other) {
-    if (other == own || columns.rates[other].hasNaN()) continue;
-    const Steps steps = rows.steps(other, 0, length);
-    if (is_sure(steps) && std::abs(now.correlation()) < 0.5) {
-      return fmt::format("it is measured by the column of {}: swapped?", columns.names[other]);
-    }
-  }
+  if (std::abs(now.correlation()) < 0.5) return other_column([](const Steps&) { return true; });
   return "";
 }
 

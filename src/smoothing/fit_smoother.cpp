@@ -9,6 +9,7 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/smoothing/smoother.hpp"
+#include "smoothing/smooth_each.hpp"
 #include "training/lbfgsb.hpp"
 
 namespace gp2 {
@@ -276,6 +277,7 @@ std::vector<Measurement> those_used(const std::vector<Measurement>& measurements
 struct Hindsight {
   std::vector<double> rates;  // dq
   std::vector<double> sizes;  // how far it is off what the others say, in standard deviations of that difference
+  double log_likelihood = 0;  // of those that are used
 };
 
 Hindsight hindsight_of(const std::vector<Measurement>& measurements, const std::vector<bool>& used, const SmootherModel& model) {
@@ -283,24 +285,25 @@ Hindsight hindsight_of(const std::vector<Measurement>& measurements, const std::
   for (const Measurement& one : measurements) {
     if (times.empty() || one.time > times.back()) times.push_back(one.time);
   }
-  const SmoothedMotion motion =
-      smooth(model, those_used(measurements, used), Eigen::Map<const VectorXd>(times.data(), static_cast<Index>(times.size())));
-  Hindsight out;
-  Index at = 0;
-  for (std::size_t k = 0; k < measurements.size(); ++k) {
-    const Measurement& one = measurements[k];
-    while (times[static_cast<std::size_t>(at)] < one.time) ++at;
-    const int row = one.velocity ? 1 : 0;
-    const double read = one.noise_factor * (one.velocity ? model.velocity_noise_stddev : model.noise_stddev);
-    const double noise = square(read) + (one.velocity ? 0 : square(model.time_stddev * one.rate));
-    const double known = motion.covariance[static_cast<std::size_t>(at)](row, row);
-    const double residual = one.value - motion.mean(row, at);
-    // without y the rest says m + (m − y) V/(R − V) with variance R V/(R − V)
-    const double variance = used[k] ? noise - known : noise + known;
-    constexpr double alone = 1e-3;  // the others say next to nothing
-    out.sizes.push_back(variance > alone * noise ? std::abs(residual) / std::sqrt(variance) : 0);
-    out.rates.push_back(motion.mean(1, at));
-  }
+  Hindsight out{std::vector<double>(measurements.size()), std::vector<double>(measurements.size())};
+  std::size_t k = measurements.size();
+  const auto look_back = [&](Index at, const Eigen::Vector3d& mean, const Eigen::Matrix3d& covariance) {
+    while (k > 0 && measurements[k - 1].time == times[static_cast<std::size_t>(at)]) {
+      const Measurement& one = measurements[--k];
+      const int row = one.velocity ? 1 : 0;
+      const double read = one.noise_factor * (one.velocity ? model.velocity_noise_stddev : model.noise_stddev);
+      const double noise = square(read) + (one.velocity ? 0 : square(model.time_stddev * one.rate));
+      const double known = covariance(row, row);
+      const double residual = one.value - mean[row];
+      // without y the rest says m + (m − y) V/(R − V) with variance R V/(R − V)
+      const double variance = used[k] ? noise - known : noise + known;
+      constexpr double alone = 1e-3;  // the others say next to nothing
+      out.sizes[k] = variance > alone * noise ? std::abs(residual) / std::sqrt(variance) : 0;
+      out.rates[k] = mean[1];
+    }
+  };
+  out.log_likelihood =
+      smooth_each(model, those_used(measurements, used), Eigen::Map<const VectorXd>(times.data(), std::ssize(times)), look_back);
   return out;
 }
 
@@ -329,7 +332,6 @@ class Trust {
  public:
   Trust(const std::vector<Measurement>& measurements, const std::vector<int>& positions, double noise_stddev, double threshold)
       : threshold_(threshold),
-        limit_(measurements.size(), threshold),
         used_(measurements.size(), true),
         accused_(measurements.size(), false),
         gross_(accused_),
@@ -342,10 +344,7 @@ class Trust {
     if (n < least) return;
     for (const auto& [inner, outer] : {std::pair(positions[1], positions[0]), std::pair(positions[n - 2], positions[n - 1])}) {
       ends_.emplace_back(inner, outer);
-      for (const int k : {inner, outer}) {
-        used_[static_cast<std::size_t>(k)] = false;
-        limit_[static_cast<std::size_t>(k)] = 2 * threshold;  // beyond an end a motion is guessed
-      }
+      for (const int k : {inner, outer}) used_[static_cast<std::size_t>(k)] = false;
     }
   }
 
@@ -357,11 +356,11 @@ class Trust {
     const std::vector<bool> before = used_;
     std::vector<double> suspected = sizes;
     for (std::size_t k = 0; k < sizes.size(); ++k) {
-      if (!used_[k] && sizes[k] <= limit_[k] && !settled_[k]) {
+      if (!used_[k] && sizes[k] <= limit(k) && !settled_[k]) {
         used_[k] = true;
         settled_[k] = accused_[k];
       }
-      if (settled_[k] || !before[k] || sizes[k] <= limit_[k]) suspected[k] = 0;
+      if (settled_[k] || !before[k] || sizes[k] <= limit(k)) suspected[k] = 0;
     }
     // what is far from a guess may be near, and yet contradict its neighbour
     for (const auto& [inner, outer] : ends_) {
@@ -391,6 +390,12 @@ class Trust {
     for (const std::vector<std::size_t>& together : neighbourhoods_left_out()) {
       for (const std::size_t k : together) gross_[k] = accused_[k] = together.size() <= 2;
     }
+  }
+
+  /// In standard deviations; beyond an end a motion is guessed.
+  [[nodiscard]] double limit(std::size_t k) const {
+    const bool is_end = std::ranges::any_of(ends_, [k](const auto& end) { return k == end.first || k == end.second; });
+    return (is_end ? 2 : 1) * threshold_;
   }
 
   void leave_out(std::size_t k) {
@@ -424,7 +429,6 @@ class Trust {
 
   double threshold_;
   std::vector<std::pair<std::size_t, std::size_t>> ends_;  // the last but one and the last
-  std::vector<double> limit_;                              // standard deviations, of each
   std::vector<bool> used_, accused_, gross_, settled_;
 };
 
@@ -440,14 +444,25 @@ double kurtosis_of(const std::vector<double>& sizes, const std::vector<bool>& us
   return second > 0 ? n * fourth / square(second) : 0;
 }
 
-}  // namespace
+/// What is said of measurements before anything is fitted.
+struct FirstLook {
+  SmootherModel rough;
+  double most_noise_stddev;
+  Trust trust;
+};
 
-SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const SmootherFitOptions& options) {
-  log_likelihood({}, measurements);  // checks them
+FirstLook first_look(const std::vector<Measurement>& measurements, const SmootherFitOptions& options) {
   const std::vector<int> positions = positions_among(measurements);
   const Roughness roughness = roughness_of(measurements, positions);
   const SmootherModel rough = rough_model(measurements, positions, roughness, options);
-  Trust trust(measurements, positions, rough.noise_stddev, options.outlier_threshold);
+  return {rough, roughness.most_noise_stddev(), Trust(measurements, positions, rough.noise_stddev, options.outlier_threshold)};
+}
+
+}  // namespace
+
+SmootherFit fit_smoother(std::vector<Measurement> measurements, const SmootherFitOptions& options) {
+  check_measurements({}, measurements, "fit_smoother");
+  auto [rough, most_noise_stddev, trust] = first_look(measurements, options);
   // of a long log a part tells the model if it moves as the whole does, and all that is left is to judge the samples
   constexpr std::size_t most_fitted = 20'000;
   constexpr double as_much = 0.5;
@@ -462,35 +477,43 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
   } else if (is_long) {
     fit = fit_smoother(part, options);
   }
-  std::vector<Measurement> all = measurements;
   bool with_time = options.estimate_time_stddev;
   constexpr int max_rounds = 20;
   for (int round = 0; round < max_rounds; ++round) {
     if (!is_known) {
-      const std::vector<Measurement> some = those_used(all, trust.used());
-      const Box box = box_of(some, rough, roughness.most_noise_stddev(), options);
+      const std::vector<Measurement> some = those_used(measurements, trust.used());
+      const Box box = box_of(some, rough, most_noise_stddev, options);
       // errors that are gone by the second round have led the first astray
       if (round < 2) search(some, box, rough, options, fit);
       maximise(some, box, fit);
     }
-    const Hindsight hindsight = hindsight_of(all, trust.used(), fit.model);
+    const Hindsight hindsight = hindsight_of(measurements, trust.used(), fit.model);
     fit.kurtosis = kurtosis_of(hindsight.sizes, trust.used());
+    if (is_known) fit.log_likelihood = hindsight.log_likelihood;  // of all, not of a part
     bool changed = trust.choose_again(hindsight.sizes);
     // the first round knows no rates, and so has no τ
     constexpr double share = 0.5;  // of the Nyquist frequency
-    const double step = spacing_of(all).usual;
-    if (round == 0 && !is_known && bandwidth_of(fit.model, step) > share / (2 * step)) with_time = false;
+    if (round == 0 && !is_known) {
+      const double step = spacing_of(measurements).usual;
+      if (bandwidth_of(fit.model, step) > share / (2 * step)) with_time = false;
+    }
     if (with_time) {
-      for (std::size_t k = 0; k < all.size(); ++k) all[k].rate = hindsight.rates[k];
+      for (std::size_t k = 0; k < measurements.size(); ++k) measurements[k].rate = hindsight.rates[k];
       changed = changed || (round == 0 && !is_long);
     }
     if (!changed) break;
   }
   fit.outliers.clear();
-  for (std::size_t k = 0; k < all.size(); ++k) {
-    if (!trust.used()[k]) fit.outliers.push_back(static_cast<int>(k));
+  std::size_t n_trusted = 0;
+  for (std::size_t k = 0; k < measurements.size(); ++k) {
+    if (trust.used()[k]) {
+      measurements[n_trusted++] = measurements[k];
+    } else {
+      fit.outliers.push_back(static_cast<int>(k));
+    }
   }
-  fit.trusted = those_used(all, trust.used());
+  measurements.resize(n_trusted);
+  fit.trusted = std::move(measurements);
   return fit;
 }
 

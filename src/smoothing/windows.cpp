@@ -5,7 +5,10 @@
 #include <cmath>
 #include <utility>
 
+#include <fmt/format.h>
 #include <Eigen/Cholesky>
+
+#include "gp2/error.hpp"
 
 namespace gp2 {
 
@@ -227,7 +230,12 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
     noise.push_back(noise_weights(samples, grid, window, c, times, weights));
   }
   const MatrixXd covariance = covariance_of(samples, noise);
-  const MatrixXd L = covariance.llt().matrixL();
+  const Eigen::LLT<MatrixXd> factor(covariance);
+  if (factor.info() != Eigen::Success) {
+    throw NumericalError(fmt::format("windows of {:.3g} s have sums that follow from each other: leave them out (`windows=none`)",
+                                     4 * grid.spacing));
+  }
+  const MatrixXd L = factor.matrixL();
   for (Index r = 0; r < std::ssize(sums); ++r) {
     Index from = 0;
     while (from < r && covariance(r, from) == 0) ++from;

@@ -183,6 +183,11 @@ TEST(Csv, IsMadeOfColumnsOfNumbersWithoutPrintingThem) {
   EXPECT_EQ(table.take({2, 0}).text(), "x,label\n-inf,late\n0.1,007\n");
 }
 
+TEST(Csv, WritesNoCellThatWouldNotReadBack) {
+  const CsvTable table = CsvTable::from_columns("frame", {{"x", {1}}, {"note", {}, {"two\nlines"}}});
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(table.text()); }), HasSubstr("'two\nlines' has a line break in it"));
+}
+
 TEST(Csv, RefusesColumnsThatAreNoTable) {
   EXPECT_EQ(input_error_of([] { CsvTable::from_columns("frame", {}); }), "frame: there are no columns");
   EXPECT_EQ(input_error_of([] { CsvTable::from_columns("frame", {{"x", {}}}); }), "frame: there are no rows");

@@ -28,6 +28,7 @@ struct Swing {
   double factor = 1;
   unsigned seed = 1;
   double outliers = 0;  // of value, at three rows
+  double offset = 0;    // of the rate
 
   [[nodiscard]] std::string text(bool wraps = false) const {
     std::mt19937 random(seed);
@@ -39,7 +40,8 @@ struct Swing {
       const double now = t[i] = dt * static_cast<double>(i), then = now - late;
       value[i] = std::sin(fast * now) + std::cos(slow * now) + (wraps ? now : 0) + normal(random);
       rates[0][i] = std::cos(now * now / 9);
-      rates[1][i] = factor * (fast * std::cos(fast * then) - slow * std::sin(slow * then) + (wraps ? 1 : 0)) + normal(random);
+      rates[1][i] =
+          factor * (fast * std::cos(fast * then) - slow * std::sin(slow * then) + (wraps ? 1 : 0)) + normal(random) + offset;
       if (i % 1'000 == 500) value[i] += outliers;
       if (wraps) value[i] = std::remainder(value[i], 2 * std::numbers::pi);
     }
@@ -100,6 +102,32 @@ TEST(RateCheck, ALagIsNamedHoweverFineTheLog) {
 TEST(RateCheck, AFactorIsNamedUnderNoiseThatHidesSingleRows) {
   EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = -1}.text()), HasSubstr("it is -"));
   EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = 180 / std::numbers::pi}.text()), HasSubstr("it is 0.017"));
+}
+
+TEST(RateCheck, AnOffsetIsNamed) {
+  for (const double noise : {0.0, 0.05}) {
+    EXPECT_THAT((Swing{.noise = noise, .offset = 1}.text()), testing::ContainsRegex("lies (1|0.99[0-9]|1.0[0-9]*) above"));
+    EXPECT_THAT((Swing{.noise = noise, .offset = -9.81}.text()), testing::ContainsRegex("lies 9.8[0-9]* below"));
+    EXPECT_THAT((Swing{.noise = noise, .offset = 0.1}.text()), IsEmpty()) << "a twentieth of the rate";
+  }
+  EXPECT_THAT((Swing{.noise = 0.01, .factor = 57, .offset = 1}.text()), Not(HasSubstr("throughout")));
+}
+
+TEST(RateCheck, SwappedColumnsAreNamedOfCoordinatesThatMoveTogether) {
+  std::mt19937 random(5);
+  std::normal_distribution<double> normal(0, 0.02);
+  const RowVectorXd t = RowVectorXd::LinSpaced(800, 0, 8), x = (3 * t.array()).sin() + 0.4 * (7 * t.array()).cos();
+  RowVectorXd dx = 3 * (3 * t.array()).cos() - 2.8 * (7 * t.array()).sin(), dy = -0.8 * dx.array() + (5 * t.array()).cos();
+  for (RowVectorXd* const one : {&dx, &dy}) {
+    for (double& value : *one) value += normal(random);
+  }
+  const std::vector<std::string> names = {"dx", "dy"};
+  EXPECT_THAT(better_rate({t, "x", x, false, {dy, dx}, names, 0}), HasSubstr("by the column of dy: swapped?"));
+  EXPECT_THAT(better_rate({t, "x", x, false, {dx, dy}, names, 0}), IsEmpty());
+  // a noisy column is not another's, though that is proportional to the rate
+  RowVectorXd noisy = dx;
+  for (double& value : noisy) value += 80 * normal(random);
+  EXPECT_THAT(better_rate({t, "x", x, false, {noisy, 0.4 * dx}, names, 0}), IsEmpty());
 }
 
 TEST(RateCheck, FewWrongValuesSayNothingOfTheirColumn) {

@@ -294,6 +294,55 @@ TEST(Smoother, DistrustsWhatTheOthersContradictAndNothingElse) {
   EXPECT_THAT(fit_smoother(spoiled, {.outlier_threshold = 0}).outliers, ElementsAre());
 }
 
+// more moments, and more different steps between them, than a filter keeps at once
+std::vector<Measurement> long_log() {
+  RandomStream random(21);
+  std::vector<Measurement> out;
+  double t = 0;
+  for (int k = 0; k < 70'000; ++k) {
+    t += 0.005 + 0.005 * random.uniform();
+    out.push_back({t, std::sin(3 * t) + 0.02 * random.normal()});
+  }
+  return out;
+}
+
+TEST(Smoother, ALongLogIsSmoothedAsAPartOfItIsFarFromItsEnds) {
+  const std::vector<Measurement> log = long_log();
+  const SmootherModel model = {Smoothness::matern72, 0.1, 1, 0.02};
+  // where blocks of moments meet, and hundreds of lengthscales around
+  for (const std::ptrdiff_t middle : {std::ptrdiff_t{1} << 15, std::ptrdiff_t{1} << 16}) {
+    const std::vector<Measurement> part(log.begin() + middle - 3000, log.begin() + middle + 3000);
+    VectorXd times(20);
+    for (Index k = 0; k < times.size(); ++k) times[k] = log[static_cast<std::size_t>(middle - 10 + k)].time;
+    const SmoothedMotion of_all = smooth(model, log, times), of_part = smooth(model, part, times);
+    EXPECT_LT((of_all.mean - of_part.mean).cwiseAbs().maxCoeff(), 1e-8);
+    for (std::size_t k = 0; k < of_all.covariance.size(); ++k)
+      EXPECT_TRUE(of_all.covariance[k].isApprox(of_part.covariance[k], 1e-8));
+  }
+}
+
+TEST(Smoother, TheGradientOfALongLogIsThatOfDifferences) {
+  const std::vector<Measurement> log = long_log();
+  const SmootherModel model = {Smoothness::matern52, 0.1, 1, 0.02};
+  VectorXd gradient;
+  log_likelihood(model, log, &gradient);
+  const auto difference = [&](double SmootherModel::*parameter) {
+    constexpr double step = 1e-5;
+    SmootherModel more = model, less = model;
+    more.*parameter *= std::exp(step), less.*parameter *= std::exp(-step);
+    return (log_likelihood(more, log) - log_likelihood(less, log)) / (2 * step);
+  };
+  EXPECT_NEAR(gradient[0], difference(&SmootherModel::lengthscale), 1e-6 * std::abs(gradient[0]));
+  EXPECT_NEAR(gradient[2], difference(&SmootherModel::noise_stddev), 1e-6 * std::abs(gradient[2]));
+}
+
+TEST(Smoother, TheLikelihoodOfAFitIsThatOfAllThatIsTrusted) {
+  const std::vector<Measurement> log = irregular(80, 12);
+  const SmootherFit fit =
+      fit_smoother(log, {.model = some_model(Smoothness::matern72), .outlier_threshold = 0, .estimate_time_stddev = false});
+  EXPECT_EQ(fit.log_likelihood, log_likelihood(fit.model, fit.trusted)) << "of a model that is given";
+}
+
 TEST(Smoother, FindsTheMotionOfALongLogThatMostlyRests) {
   // where none of the stretches that would tell the model is
   std::vector<Measurement> log;

@@ -81,7 +81,7 @@ struct SmootherFitOptions {
 /// A model and what it was told.
 struct SmootherFit {
   SmootherModel model;
-  double log_likelihood = 0;
+  double log_likelihood = 0;  // of those that are trusted
   bool converged = false;
   bool noise_at_least = false;       // the noise of q ended at the least that the options allow
   double kurtosis = 0;               // of how far measurements are off the others; 3 where the motion is as rough everywhere
@@ -93,7 +93,7 @@ struct SmootherFit {
 /// Lengthscale, size and noise of a motion by maximum likelihood, without the measurements that the others contradict. The
 /// farthest of its neighbourhood is taken away first, the model fitted anew, and a measurement taken back that agrees after all.
 /// @throws InputError as log_likelihood, for fewer than 5 positions, and when all positions are the same.
-SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const SmootherFitOptions& options = {});
+SmootherFit fit_smoother(std::vector<Measurement> measurements, const SmootherFitOptions& options = {});
 
 /// The step of an encoder: of whole multiples of it 95 of 100 values are off the one that is there most often; 0 where there is
 /// none.

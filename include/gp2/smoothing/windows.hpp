@@ -43,6 +43,7 @@ struct WindowGrid {
 /// @param windows    rising
 /// @param times      of the states, rising, at least 4 (N)
 /// @param row, first_state  as WeightedSum: `first_state` is the number of the first of these states
+/// @throws NumericalError where sums follow from each other: the windows are too narrow for the samples.
 /// @returns divided by spacing, so that they count as accelerations; without windows that have no samples inside, or none for longer
 ///   than a spacing.
 std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& positions, const SmootherModel& model,
