@@ -8,6 +8,7 @@
 
 #include <fmt/format.h>
 #include <gtest/gtest.h>
+#include <unistd.h>
 #include <Eigen/QR>
 
 #include "base/random.hpp"
@@ -69,10 +70,12 @@ constexpr const char* tree = R"(<mujoco>
   </equality>
 </mujoco>)";
 
+// in a folder of this process: tests of one file run side by side
 std::filesystem::path written(const std::string& text, const char* name) {
-  const std::filesystem::path path = std::filesystem::path(testing::TempDir()) / name;
-  std::ofstream(path) << text;
-  return path;
+  const std::filesystem::path folder = std::filesystem::path(testing::TempDir()) / fmt::format("robots_{}", getpid());
+  std::filesystem::create_directories(folder);
+  std::ofstream(folder / name) << text;
+  return folder / name;
 }
 
 std::filesystem::path source_path(const char* path) { return std::filesystem::path(GP2_SOURCE_DIR) / path; }
