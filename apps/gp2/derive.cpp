@@ -62,10 +62,14 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
   if (shared > 0)
     counts.push_back(count_of(static_cast<int>(shared), "episode too short for a model of its own",
                               "episodes too short for a model of their own"));
-  const auto at_least = std::count_if(series.begin(), series.end(), [](const DerivedSeries* one) { return one->noise_at_least; });
-  if (at_least > 0)
-    counts.push_back("noise at that of rounding" +
-                     (series.size() > 1 ? fmt::format(" in {} of {} episodes", at_least, series.size()) : ""));
+  const auto add_if_any = [&](bool DerivedSeries::*is, const std::string& what) {
+    const auto n = std::count_if(series.begin(), series.end(), [is](const DerivedSeries* one) { return one->*is; });
+    if (n > 0) counts.push_back(what + (series.size() > 1 ? fmt::format(" in {} of {} episodes", n, series.size()) : ""));
+  };
+  add_if_any(&DerivedSeries::noise_at_least, "noise at that of rounding");
+  add_if_any(&DerivedSeries::noise_unseen,
+             "no noise seen: there is none, as in a simulated log, or the motion is too fast for these samples to tell it "
+             "from, and the deviation of the positions is too small");
   if (!counts.empty()) text += fmt::format("; {}", fmt::join(counts, ", "));
   return text;
 }

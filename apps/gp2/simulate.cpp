@@ -60,12 +60,13 @@ void print_motions(const std::vector<SimulatedMotion>& motions, const System& sy
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
   const std::vector<std::string> accelerations = system.acceleration_names();
-  if (with_sample) csv.add("sample");
+  if (with_sample) csv.add("episode");
   csv.add("t");
   for (int k = 0; k < layout.t(); ++k) csv.add(names[static_cast<std::size_t>(k)]);
   for (const std::string& name : accelerations) csv.add(name);
   for (const std::string& name : system.inputs()) csv.add(name);
-  if (system.nc() > 0) {
+  const bool with_multipliers = motions.front().trajectory.records.rows() > 0;  // not of a baseline
+  if (with_multipliers) {
     for (const std::string& name : View::multipliers(system).names(system)) csv.add(name);
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
@@ -86,7 +87,7 @@ void print_motions(const std::vector<SimulatedMotion>& motions, const System& sy
       add(trajectory.states.col(i).head(2 * layout.nq));
       add(trajectory.accelerations.col(i));
       add(trajectory.commands.col(i));
-      if (system.nc() > 0) add(trajectory.records.col(i));
+      if (with_multipliers) add(trajectory.records.col(i));
       if (with_stddev) {
         add(motions[k].uncertainty->stddev.col(i));
         csv.add(motions[k].uncertainty->distance[i]);

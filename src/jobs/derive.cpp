@@ -387,7 +387,7 @@ class Deriver {
       int n = 0, n_fast = 0;
       double rate = 0;
       for (const DerivedSeries& one : data_.series) {
-        if (one.coordinate != j) continue;
+        if (one.coordinate != j || one.noise_unseen) continue;
         ++n;
         const bool stands_out = one.kurtosis > even || one.outliers >= many * (one.used + one.outliers);
         if (!stands_out || !(one.bandwidth > share * one.rate / 2)) continue;
@@ -417,6 +417,7 @@ class Deriver {
     out.episode = task.episode;
     out.model = task.model;
     out.noise_at_least = task.fit.noise_at_least && task.channel.resolution > 0;
+    out.noise_unseen = task.fit.noise_at_least && !out.noise_at_least;
     out.shared_model = shared;
     out.kurtosis = task.kurtosis;
     out.gain = task.gain;

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <functional>
 #include <limits>
+#include <numeric>
 #include <optional>
 #include <utility>
 
@@ -132,6 +133,7 @@ struct Doubted {
   const std::vector<std::vector<int>>& taken;  // which they are, where those follow each other in time; empty: they do not
   const std::vector<std::string>& held;        // parameters
   const FittedValues& fitted_values;
+  const int lines_apart;  // in its log, of a state and the next one
 
   /// What changes where the input rows of the states are others, and what one of them adds then. Nothing where that is no number.
   template <typename StatesOf>
@@ -168,7 +170,8 @@ struct Doubted {
     });
     if (!out) return out;
     out->rows = rows;
-    out->text = fmt::format("it acts {} row{} {} than logged", std::abs(rows), std::abs(rows) == 1 ? "" : "s",
+    const int lines = lines_apart * std::abs(rows);
+    out->text = fmt::format("it acts {}{} row{} {} than logged", lines_apart == 1 ? "" : "about ", lines, lines == 1 ? "" : "s",
                             rows > 0 ? "later" : "earlier");
     out->cause =
         rows > 0 ? "It has a delay or a lag that the model lacks, or its column leads" : "Its column lags, or the others lead";
@@ -189,6 +192,21 @@ struct Doubted {
     return out;
   }
 };
+
+// How many lines of its log a state is from the next one, 1 where that is not known; nothing where logs differ in it.
+std::optional<int> lines_apart(const std::vector<std::vector<int>>& lines) {
+  std::optional<int> apart;
+  for (const std::vector<int>& of_log : lines) {
+    if (of_log.size() < 2) continue;
+    std::vector<int> steps(of_log.size());
+    std::adjacent_difference(of_log.begin(), of_log.end(), steps.begin());
+    const auto middle = steps.begin() + 1 + static_cast<std::ptrdiff_t>(steps.size() - 1) / 2;
+    std::nth_element(steps.begin() + 1, middle, steps.end());  // some lines were left out
+    if (apart && *apart != *middle) return std::nullopt;
+    apart = *middle;
+  }
+  return apart.value_or(1);
+}
 
 constexpr double least_gain = 10;  // nats
 constexpr int most_late = 16;      // by which an input is taken to be late
@@ -499,13 +517,15 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   const std::vector<Observations> some = of_windows ? all : evenly(all, n_some);
   // of many states some are kept, which do not follow each other
   const bool are_all = posterior.n_states() == n_states(all);
-  const auto taken = has_row_order && are_all && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
+  const std::optional<int> apart = lines_apart(lines);
+  const auto taken =
+      has_row_order && are_all && apart && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
   const std::vector<bool> force = system.reads(SystemPart::force), elsewhere = system.reads(SystemPart::mechanics);
   // a latent that reads an input takes up what it does otherwise
   const auto is_learned = [&](int row) {
     return std::any_of(prior.latents.begin(), prior.latents.end(), [&](const Latent& one) { return one.features->reads(row); });
   };
-  const Doubted doubted{posterior, some, taken, held, fitted_values};
+  const Doubted doubted{posterior, some, taken, held, fitted_values, apart.value_or(1)};
   std::vector<InputEffect> inputs;
   bool has_far_values = false;
   for (int j = 0; j < layout.nu && prior.mean == Prior::Mean::force; ++j) {

@@ -354,6 +354,25 @@ void add_impossible_note(int n_impossible, int n_draws, std::vector<std::string>
                               n_impossible, n_draws));
 }
 
+// What the values of a group measure: of accelerations, no more than the constraints leave free.
+std::ptrdiff_t n_independent(const Posterior& posterior, const Observations& group) {
+  const auto n_finite = [&](Eigen::Index i) {
+    return static_cast<std::ptrdiff_t>(group.values().col(i).array().isFinite().count());
+  };
+  std::ptrdiff_t n = 0;
+  if (!group.view().is_of_ddq()) {
+    for (Eigen::Index i = 0; i < group.n_data(); ++i) n += n_finite(i);
+    return n;
+  }
+  const System& system = prior_of(posterior.prior(), group.view()).reference_system();
+  for_each_mechanics(system, group.states(), parameters_of(group.view(), posterior.values().parameters), 1,
+                     [&](Eigen::Index first, const MechanicsBatch& mechanics) {
+                       for (const UdwadiaKalaba& projection : mechanics.projections)
+                         n += std::min<std::ptrdiff_t>(n_finite(first++), system.nq() - projection.rank());
+                     });
+  return n;
+}
+
 void add_few_values_note(const FitReport& report, const Posterior& posterior, std::vector<std::string>& notes) {
   constexpr std::ptrdiff_t enough = 3;  // values for each unknown
   const auto is_estimated = [](const Hyperparameter& h) { return h.is_system_parameter() && !h.is_fixed() && !h.at_bound(); };
@@ -363,12 +382,8 @@ void add_few_values_note(const FitReport& report, const Posterior& posterior, st
   for (const Latent& latent : posterior.prior().latents) {
     if (!latent.kernel_is_fixed) n_unknown += latent.size();  // of the discrepancy little is asked
   }
-  for (const Observations& group : posterior.observations()) {
-    // what a constraint makes of others is no measurement of its own
-    const System& system = prior_of(posterior.prior(), group.view()).reference_system();
-    const std::ptrdiff_t most = group.view().is_of_ddq() ? system.nq() - system.nc() : group.view().size();
-    for (const auto& row : group.values().colwise()) n_values += std::min<std::ptrdiff_t>(row.array().isFinite().count(), most);
-  }
+  if (n_states(posterior.observations()) >= enough * n_unknown) return;
+  for (const Observations& group : posterior.observations()) n_values += n_independent(posterior, group);
   if (n_values >= enough * n_unknown) return;
   notes.push_back(
       fmt::format("warning: {} measured values are few for {} estimated parameters and {} functions: standard errors may be "
@@ -389,7 +404,7 @@ void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
   const double worst = report.draws->r_hat.maxCoeff(&k);
   if (!(worst > HyperparameterDraws::largest_r_hat)) return;
   notes.push_back(
-      fmt::format("the chains that draw hyperparameters have not mixed (R̂ {:.2f} of {}, near 1 where they have): they stay with "
+      fmt::format("the chains that draw hyperparameters have not mixed (R̂ {:.3g} of {}, near 1 where they have): they stay with "
                   "explanations of "
                   "their own, whose shares rest on Laplace's approximation; the same fit with another `seed` tells what it means "
                   "for predictions",

@@ -411,7 +411,7 @@ Observations with_windows(const Observations& rows, const Windows& windows, cons
       sums.push_back(std::move(sum));
     }
   }
-  return rows.with_sums(std::move(sums));
+  return sums.empty() ? rows : rows.with_sums(std::move(sums));
 }
 
 }  // namespace

@@ -1,9 +1,8 @@
 #include "gp2/jobs/generate_job.hpp"
 
-#include <cmath>
-
 #include <fmt/format.h>
 
+#include "base/number_range.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -13,8 +12,8 @@ namespace {
 Eigen::VectorXd noise_of(const Model& model, const std::optional<double>& given) {
   const Eigen::Index nq = model.system->nq();
   if (given) {
-    if (!(*given >= 0)) throw InputError(fmt::format("`noise_std`: must not be negative, got {}", *given));
-    if (std::isinf(*given)) throw InputError("`noise_std`: must be finite, got inf");
+    if (!(*given >= 0 && *given <= largest_number))
+      throw InputError(fmt::format("`noise_std`: must be 0 … {:.0e}, got {}", largest_number, *given));
     return Eigen::VectorXd::Constant(nq, *given);
   }
   if (model.noise.stddev.empty()) {

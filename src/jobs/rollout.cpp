@@ -255,7 +255,7 @@ class Roll {
   }
 
   void add_forces(const MatrixXd& measured, Rollout& out) const {
-    if (system_.nc() == 0) return;
+    if (system_.nc() == 0 || posterior_.prior().reference) return;
     View view = View::multipliers(system_);
     view.other_system = asked_.other_system;
     const Posterior::Marginal forces = posterior_.marginal(view, measured, /*n_threads=*/0);

@@ -325,7 +325,8 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
     SimulateJob::Motion motion{parameters, of_view(ddq)};
     motion.contacts = contacts_of(model, parameters);
     motion.pushed = pushed_acceleration(posterior.prior(), at_system(ddq), function);
-    if (model.system->nc() > 0) motion.multipliers = of_view(View::multipliers(*model.system));
+    // a baseline knows no constraints
+    if (model.system->nc() > 0 && !posterior.prior().reference) motion.multipliers = of_view(View::multipliers(*model.system));
     if (has_energy) motion.energy = energy;
     job.motions.push_back(std::move(motion));
   };

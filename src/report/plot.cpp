@@ -112,6 +112,7 @@ std::vector<Option> options(PlotRequest& request) {
 }
 
 LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& request) {
+  if (posterior.prior().reference) throw InputError("nothing to draw: a baseline learns accelerations, and no force");
   std::vector<LearnedCurve> curves;
   for (const LearnedForce& one : learned_forces(posterior)) {
     const double largest = one.mean.cwiseAbs().maxCoeff() + one.stddev.maxCoeff();

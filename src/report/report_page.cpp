@@ -268,7 +268,7 @@ Json rollout_json(const System& system, const Rollout& rollout, const Spelling& 
           {"leaves", rollout.leaves ? Json(*rollout.leaves) : Json()},
           {"leaving", rollout.leaving},
           {"far_from", rollout.far_from ? Json(*rollout.far_from) : Json()},
-          {"multipliers", View::multipliers(system).names(system)},
+          {"multipliers", rollout.multipliers.rows() > 0 ? View::multipliers(system).names(system) : std::vector<std::string>()},
           {"lambda", rows_json(rollout.multipliers)},
           {"lambda_stddev", rows_json(rollout.multipliers_stddev)},
           {"lambda_simulated", rows_json(rollout.simulated_multipliers)},

@@ -14,10 +14,14 @@ namespace gp2 {
 
 namespace {
 
-// "q3 = 0.097, dq3 = -0.04"
-std::string listed(const std::vector<std::string>& names, const Eigen::VectorXd& state, const std::vector<int>& entries) {
+// "q3 = 0.097, dq3 = -0.04 for -0.1", where something else than 0 stood before
+std::string listed(const std::vector<std::string>& names, const Eigen::VectorXd& state, const std::vector<int>& entries,
+                   const Eigen::VectorXd& before) {
   std::vector<std::string> parts;
-  for (const int k : entries) parts.push_back(fmt::format("{} = {:.6g}", names[static_cast<std::size_t>(k)], state[k]));
+  for (const int k : entries) {
+    parts.push_back(fmt::format("{} = {:.6g}", names[static_cast<std::size_t>(k)], state[k]));
+    if (before[k] != 0 && before[k] != state[k]) parts.back() += fmt::format(" for {:.6g}", before[k]);
+  }
   return fmt::format("{}", fmt::join(parts, ", "));
 }
 
@@ -140,6 +144,7 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
                                std::vector<std::string>& notes) {
   const System& system = *model.system;
   const std::vector<std::string> names = system.state_names();
+  const Eigen::VectorXd before = start.state;  // by a log, of what is open too
   std::vector<int> open;
   for (int k = 0; k < 2 * system.nq(); ++k) {
     if (start.given[static_cast<std::size_t>(k)]) continue;
@@ -154,7 +159,7 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
     notes.push_back(
         fmt::format("warning: `start`: {}, as '{}' has no residuals to solve its constraints by: name all "
                     "coordinates and velocities",
-                    listed(names, start.state, open), system.name()));
+                    listed(names, start.state, open, start.state), system.name()));
     return start.state;
   }
   Nearest found;
@@ -174,7 +179,11 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
   }
   std::vector<int> solved;
   std::ranges::copy_if(open, std::back_inserter(solved), [&](int k) { return found.projected[k] != start.state[k]; });
-  if (!solved.empty()) notes.push_back(fmt::format("start: from the constraints {}", listed(names, found.projected, solved)));
+  if (solved.empty()) return found.start;
+  const bool is_another = std::ranges::any_of(solved, [&](int k) { return before[k] != 0; });
+  notes.push_back(fmt::format("{}start: from the constraints {}",
+                              is_another && is_beyond_rounding(system, before, found.projected) ? "warning: " : "",
+                              listed(names, found.projected, solved, before)));
   return found.start;
 }
 

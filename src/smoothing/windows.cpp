@@ -84,6 +84,20 @@ bool is_covered(const Samples& samples, const WindowGrid& grid, const Window& wi
   return samples.time[last] - samples.time[first] > 2 * grid.spacing;
 }
 
+// Whether states do, of which rows may have been left out: cubics do not reach across more than what the window resolves.
+bool has_states(const Samples& samples, const WindowGrid& grid, const Window& window, const VectorXd& times) {
+  const double begin = samples.time[static_cast<std::size_t>(window.first - 1)];
+  const double end = samples.time[static_cast<std::size_t>(window.first + window.b.size())];
+  const Index n = times.size();
+  const Index first = std::max<Index>(0, std::upper_bound(times.begin(), times.end(), begin) - times.begin() - 1);
+  const Index last = std::min<Index>(n - 1, std::lower_bound(times.begin(), times.end(), end) - times.begin());
+  if (last <= first) return false;
+  for (Index i = first; i < last; ++i) {
+    if (times[i + 1] - times[i] > grid.spacing) return false;
+  }
+  return times[first] - begin <= times[first + 1] - times[first] && end - times[last] <= times[last] - times[last - 1];
+}
+
 // Σ_i b_i ((q_{i+1} − q_i)/h_i − (q_i − q_{i−1})/h_{i−1}) as weights of the q, from q_{first−1} on
 VectorXd weights_of_positions(const Samples& samples, const Window& window) {
   VectorXd c = VectorXd::Zero(window.b.size() + 2);
@@ -213,7 +227,7 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
   std::vector<WeightedSum> sums;
   for (const int number : windows) {
     const Window window = make_window(samples, grid, number);
-    if (!is_covered(samples, grid, window)) continue;
+    if (!is_covered(samples, grid, window) || !has_states(samples, grid, window, times)) continue;
     const VectorXd c = weights_of_positions(samples, window) / grid.spacing;
     const VectorXd weights = weights_of_states(samples, window, times) / grid.spacing;
     Index from = 0, to = weights.size();

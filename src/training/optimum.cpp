@@ -278,10 +278,12 @@ class Training {
         restored[k].value = hyperparameters_[k].value;
       }
     }
-    const double objective = reports_[from].objective;
-    if (objective_(coordinates(restored), nullptr, workspace) <= objective + 1e-9 * (1 + std::abs(objective))) {
-      results_[from] = std::move(restored);
-    }
+    RestartReport& report = reports_[from];
+    const double objective = objective_(coordinates(restored), nullptr, workspace);
+    if (!(objective <= report.objective + 1e-9 * (1 + std::abs(report.objective)))) return;
+    results_[from] = std::move(restored);
+    report.objective = objective;
+    report.negative_log_likelihood = objective - negative_log_hyperpriors(results_[from], nullptr);
   }
 
   void store(std::size_t restart, const LbfgsbResult& result) {

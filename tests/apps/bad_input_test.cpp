@@ -173,7 +173,7 @@ const std::vector<BadInput> bad_inputs = {
     {"GenerateInfiniteNoise",
      nothing,
      "gp2 generate model.toml --n 5 --noise-std inf -o old.csv",
-     {"--noise-std: must be finite, got inf"}},
+     {"--noise-std: must be 0 … 1e+100, got inf"}},
     {"OutputThroughALinkToNowhere",
      [](const Desk& desk) { std::filesystem::create_symlink("absent/target.csv", desk / "link.csv"); },
      "gp2 predict fit.json --states train.csv -o link.csv",

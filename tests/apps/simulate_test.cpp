@@ -240,11 +240,11 @@ TEST_F(SimulateFit, AnEnsembleOfSamplesStaysOnTheConstraint) {
   EXPECT_LE(report["max_position_drift"], 1e-12);
   EXPECT_LE(report["max_velocity_drift"], 1e-12);
   const CsvTable ensemble = desk.table("a.csv");
-  EXPECT_EQ(ensemble.header()[0], "sample");
+  EXPECT_EQ(ensemble.header()[0], "episode");
   ASSERT_EQ(ensemble.n_rows(), 18);
   std::set<double> ends;
   for (int k = 0; k < 3; ++k) {
-    EXPECT_EQ(number(ensemble, 6 * k, "sample"), k);
+    EXPECT_EQ(number(ensemble, 6 * k, "episode"), k);
     EXPECT_EQ(number(ensemble, 6 * k, "t"), 0);
     EXPECT_EQ(number(ensemble, 6 * k, "q1"), 0.4);
     ends.insert(number(ensemble, 6 * k + 5, "q1"));

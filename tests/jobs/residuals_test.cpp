@@ -548,22 +548,35 @@ TEST(Residuals, TellOfSingleValuesThatAreFarOff) {
 }
 
 TEST(Residuals, TellOfAnInputThatActsLate) {
-  const auto notes_of_delay = [](double delay, double lag, std::optional<int> max_points = {}) {
+  const auto fit_to = [](CsvTable log) {
     FitRequest request;
     request.model = test::late_cart("'u'");
-    request.logs = {{test::late_cart_log(delay, lag, 100, 2, 47)}};
+    request.logs = {{std::move(log)}};
     request.problem.mean = Prior::Mean::force;
-    request.problem.max_points = max_points;
+    request.thin = false;
     request.restarts = 1;
+    return request;
+  };
+  const auto notes_of_fit_to = [](FitRequest request) {
     return notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input ");
   };
+  const auto log_of = [](double delay, double lag) { return test::late_cart_log(delay, lag, 100, 2, 47); };
+  const auto notes_of_delay = [&](double delay, double lag) { return notes_of_fit_to(fit_to(log_of(delay, lag))); };
   EXPECT_THAT(notes_of_delay(0, 0), testing::IsEmpty());
   EXPECT_THAT(notes_of_delay(0.001, 0), testing::IsEmpty()) << "a tenth of a row";
   EXPECT_THAT(notes_of_delay(0.03, 0), testing::ElementsAre(HasSubstr("it acts 3 rows later than logged")));
   EXPECT_THAT(notes_of_delay(0.04, 0), testing::ElementsAre(HasSubstr("it acts 4 rows later than logged")));
   EXPECT_THAT(notes_of_delay(0.02, 0.02), testing::ElementsAre(HasSubstr("later than logged")));
-  EXPECT_THAT(notes_of_delay(0.04, 0, 150), Not(Contains(HasSubstr("later than logged")))) << "rows in no order";
   EXPECT_THAT(notes_of_delay(0.2, 0), Not(Contains(HasSubstr(" than logged")))) << "20 rows, and 16 are tried";
+  FitRequest shuffled = fit_to(log_of(0.04, 0));
+  shuffled.problem.max_points = 150;
+  EXPECT_THAT(notes_of_fit_to(std::move(shuffled)), Not(Contains(HasSubstr("later than logged")))) << "rows in no order";
+  FitRequest thinned = fit_to(test::late_cart_log(0.04, 0, 200, 2, 47));
+  thinned.thin = true;  // to every third row
+  EXPECT_THAT(notes_of_fit_to(std::move(thinned)),
+              testing::ElementsAre(AnyOf(HasSubstr("it acts about 6 rows later than logged"),
+                                         HasSubstr("it acts about 9 rows later than logged"))))
+      << "8 rows of the log";
 }
 
 TEST(Residuals, TellOfInputsThatAreSwapped) {

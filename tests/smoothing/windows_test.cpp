@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <numbers>
 
 #include <gtest/gtest.h>
@@ -180,6 +181,23 @@ TEST(WindowedAccelerations, LeaveOutWindowsWithAPause) {
     EXPECT_NEAR(sum.weights.sum() * 2, sum.value, 1e-8);
   }
   EXPECT_GT(sums.size(), 10U);
+}
+
+// Rows are left out where an input is not known, or a value is missing: what a cubic makes of the nearest ones is no acceleration.
+TEST(WindowedAccelerations, LeaveOutWindowsWhoseStatesAreLeftOut) {
+  const VectorXd times = VectorXd::LinSpaced(401, 0, 4);
+  std::vector<double> kept;
+  std::ranges::copy_if(times, std::back_inserter(kept), [](double t) { return t >= 0.5 && (t < 2 || t >= 2.3); });
+  const VectorXd states = Eigen::Map<const VectorXd>(kept.data(), std::ssize(kept));
+  const auto sums_of = [&](const VectorXd& of_states) {
+    return windowed_accelerations(positions_of(times, [](double t) { return -std::sin(5 * t) / 25; }), model, {-0.2, 0.1},
+                                  up_to(40), of_states, 0, 0);
+  };
+  const std::vector<WeightedSum> some = sums_of(states);
+  EXPECT_GT(some.size(), 20U);
+  EXPECT_LT(some.size(), sums_of(times).size() - 8);
+  for (const WeightedSum& sum : some)
+    EXPECT_NEAR(sum.value, applied(sum, states, [](double t) { return std::sin(5 * t); }), 1e-6) << states[sum.first];
 }
 
 TEST(WindowedAccelerations, TakeTheMeanOfWhatIsMeasuredAtOneTime) {

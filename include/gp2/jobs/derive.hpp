@@ -44,6 +44,7 @@ struct DerivedSeries {
   int episode = 0;              // among DerivedData::episodes
   SmootherModel model;          // of the positions about their mean
   bool noise_at_least = false;  // the noise ended at that of rounding to the resolution
+  bool noise_unseen = false;    // or, without one, at the least there is: none, or none that the samples tell from the motion
   bool shared_model = false;    // too short for a model of its own: that of the others' middle lengthscale
   double resolution = 0;        // step of the encoder; 0: none found
   double kurtosis = 0;          // as SmootherFit

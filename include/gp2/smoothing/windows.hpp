@@ -45,7 +45,7 @@ struct WindowGrid {
 /// @param row, first_state  as WeightedSum: `first_state` is the number of the first of these states
 /// @throws NumericalError where sums follow from each other: the windows are too narrow for the samples.
 /// @returns divided by spacing, so that they count as accelerations; without windows that have no samples inside, or none for longer
-///   than a spacing.
+///   than a spacing, or no states for longer.
 std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& positions, const SmootherModel& model,
                                                 const WindowGrid& grid, const std::vector<int>& windows,
                                                 const Eigen::VectorXd& times, int row, int first_state);
