@@ -11,6 +11,7 @@
 #include "base/lapack.hpp"
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
+#include "gp2/error.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/training/robust.hpp"
 #include "training/curvature.hpp"
@@ -36,8 +37,10 @@ class ThinnedProblem {
     const std::vector<Observations> trusted = problem.robust ? without_gross_errors(problem.observations) : problem.observations;
     for (std::size_t g = 0; g < trusted.size(); ++g) {
       std::vector<int> rows;
-      for (int i = every / 2; i < trusted[g].n_data(); i += every) rows.push_back(i);
-      observations_.push_back(trusted[g].without_sums().take(rows));
+      // windows of time count the errors of what was smoothed, which rows share
+      const int step = trusted[g].has_sums() ? 1 : every;
+      for (int i = step / 2; i < trusted[g].n_data(); i += step) rows.push_back(i);
+      observations_.push_back(step == 1 ? trusted[g] : trusted[g].take(rows));
       std::optional<CommandedRows>& commanded = commanded_.emplace_back(problem.commanded[g]);
       if (!commanded) continue;
       for (std::size_t k = 0; k < rows.size(); ++k) commanded->places[k] = commanded->places[static_cast<std::size_t>(rows[k])];
@@ -288,7 +291,12 @@ class ActuatorTraining {
       }
     }
     if (free.empty() || is_set(options_.stop)) return out;
-    const MatrixXd information = information_of(free);
+    MatrixXd information;
+    try {
+      information = information_of(free);
+    } catch (const NumericalError&) {
+      return out;  // without deviations: an estimate stands where J is not finite near it
+    }
     const Eigen::LDLT<MatrixXd> decomposed(information);
     const bool has_peak = decomposed.isPositive() && decomposed.rcond() > 1e-12;
     const MatrixXd covariance = decomposed.solve(MatrixXd::Identity(information.rows(), information.cols()));

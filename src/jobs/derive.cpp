@@ -679,7 +679,7 @@ class Deriver {
       if (!contradicted) data_.notes.push_back(fact + ": `hold_constraints` makes use of that");
     }
     if (contradicted) data_.notes.push_back(fmt::format("warning: {}: {}", log_.name(), *contradicted));
-    if (options_.hold_constraints && redundancy == 0)
+    if (options_.hold_constraints && redundancy == 0 && system_.nc() > 0)
       data_.notes.emplace_back("no constraint holds among the measured coordinates alone: there is nothing to hold");
   }
 
