@@ -3,6 +3,7 @@
 #include <atomic>
 #include <cstdint>
 #include <functional>
+#include <map>
 #include <memory>
 #include <optional>
 #include <string>
@@ -117,6 +118,9 @@ struct ActuatorEstimate {
   double value = 0;             // [s]
   double stddev = 0;            // [s] NaN at a bound, ∞ where the data do not determine it
   double lower = 0, upper = 0;  // bounds [s]
+  /// By how much its error moves estimated parameters: a column, with an entry for each of them, of a factor of what the errors of
+  /// all delays and lags add to their covariance. Counted by parameter_uncertainty.
+  std::map<std::string, double> moves = {};
 
   [[nodiscard]] bool at_lower() const { return value - lower <= 1e-6 * (upper - lower); }
   [[nodiscard]] bool at_upper() const { return upper - value <= 1e-6 * (upper - lower); }
@@ -148,7 +152,7 @@ struct FitReport {
   std::vector<RestartReport> restarts;
   std::optional<LaplaceUncertainty> uncertainty;  // of the hyperparameters, in their order
   std::optional<HyperparameterDraws> draws;       // of FitOptions::n_draws
-  std::vector<ActuatorEstimate> actuators;        // known from then on: nothing above allows for their errors
+  std::vector<ActuatorEstimate> actuators;        // known from then on: of their errors `moves` alone tells
   std::vector<DistrustedValue> distrusted;        // of a robust fit, the farthest first
   std::optional<InducingReport> inducing;         // of FitOptions::n_inducing
   double seconds = 0;

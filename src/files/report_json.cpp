@@ -178,6 +178,7 @@ Json actuators_json(const std::vector<ActuatorEstimate>& estimates) {
     json.push_back(
         {{"name", one.name}, {"value", one.value}, {"stddev", one.stddev}, {"lower", one.lower}, {"upper", one.upper}});
     if (std::isinf(one.stddev)) json.back()["undetermined"] = true;  // stddev is null, as where it is NaN
+    if (!one.moves.empty()) json.back()["moves"] = one.moves;
   }
   return json;
 }
@@ -199,6 +200,8 @@ std::vector<ActuatorEstimate> actuators_from(const ParsedJson& json, std::vector
     estimate.upper = number(one.at("upper"));
     const bool is_open = one.value("undetermined", false);
     estimate.stddev = is_open ? std::numeric_limits<double>::infinity() : number_or_missing(one.at("stddev"));
+    if (!one.contains("moves")) continue;
+    for (const auto& [parameter, move] : one.at("moves").items()) estimate.moves.emplace(parameter, number(move));
   }
   set_values(values, actuators);
   return estimates;

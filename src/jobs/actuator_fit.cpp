@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 
 #include <fmt/format.h>
 #include <Eigen/Cholesky>
@@ -291,15 +292,15 @@ class ActuatorTraining {
       }
     }
     if (free.empty() || is_set(options_.stop)) return out;
-    MatrixXd information;
+    std::optional<Peak> peak;
     try {
-      information = information_of(free);
+      peak = peak_over(free);
     } catch (const NumericalError&) {
       return out;  // without deviations: an estimate stands where J is not finite near it
     }
-    const Eigen::LDLT<MatrixXd> decomposed(information);
+    const Eigen::LDLT<MatrixXd> decomposed(peak->information);
     const bool has_peak = decomposed.isPositive() && decomposed.rcond() > 1e-12;
-    const MatrixXd covariance = decomposed.solve(MatrixXd::Identity(information.rows(), information.cols()));
+    const MatrixXd covariance = decomposed.solve(MatrixXd::Identity(std::ssize(free), std::ssize(free)));
     for (Index f = 0; f < std::ssize(free); ++f) {
       const Index k = free[static_cast<std::size_t>(f)];
       ActuatorEstimate& one = out[static_cast<std::size_t>(k)];
@@ -307,6 +308,15 @@ class ActuatorTraining {
       // wider than a box that is believed evenly is no peak
       if (one.stddev > (one.upper - one.lower) / std::sqrt(12.0)) one.stddev = not_a_number;
       if (is_open(k)) one.stddev = infinity;
+    }
+    const auto is_known = [&](Index k) { return std::isfinite(out[static_cast<std::size_t>(k)].stddev); };
+    if (!std::ranges::all_of(free, is_known)) return out;
+    const MatrixXd moves = peak->slopes * MatrixXd(covariance.llt().matrixL());
+    for (Index k = 0; k < x_.size(); ++k) {
+      const Hyperparameter& h = problem_.hyperparameters[static_cast<std::size_t>(k)];
+      if (!h.is_system_parameter()) continue;
+      for (Index f = 0; f < std::ssize(free); ++f)
+        out[static_cast<std::size_t>(free[static_cast<std::size_t>(f)])].moves.emplace(h.name, moves(k, f));
     }
     return out;
   }
@@ -331,8 +341,13 @@ class ActuatorTraining {
            value(x_, moved(k, upper_[k] - a_[k])) < most;
   }
 
-  // J_aa − J_ax J_xx⁻¹ J_xa: the curvature of J over a where x is the likeliest there.
-  [[nodiscard]] MatrixXd information_of(const std::vector<Index>& free) const {
+  // J about its lowest point, over those of a that are free.
+  struct Peak {
+    MatrixXd information;  // J_aa − J_ax J_xx⁻¹ J_xa: the curvature where x is the likeliest there
+    MatrixXd slopes;       // −J_xx⁻¹ J_xa: of that x
+  };
+
+  [[nodiscard]] Peak peak_over(const std::vector<Index>& free) const {
     const std::vector<Observations> observations = rows_.under(a_);
     const Objective objective = objective_of(observations);
     const Curvature of_x = curvature_at(objective, x_, objective.at(x_), n_threads_, options_.stop);
@@ -350,7 +365,9 @@ class ActuatorTraining {
     }
     const MatrixXd seen = of_x.eigenvectors.transpose() * of_x.unit.asDiagonal() * mixed(of_x.free, Eigen::all);
     const VectorXd known = (of_x.eigenvalues.array() > of_x.zero).select(of_x.eigenvalues.cwiseInverse(), 0);
-    return (of_a + of_a.transpose()) / 2 - seen.transpose() * known.asDiagonal() * seen;
+    Peak peak{(of_a + of_a.transpose()) / 2 - seen.transpose() * known.asDiagonal() * seen, MatrixXd::Zero(x_.size(), m)};
+    peak.slopes(of_x.free, Eigen::all) = of_x.unit.asDiagonal() * of_x.eigenvectors * -(known.asDiagonal() * seen);
+    return peak;
   }
 
   const FitProblem& problem_;

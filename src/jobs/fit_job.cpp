@@ -394,13 +394,6 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     add_tests(job, options, result.report, outcome);
   }
   for (std::string& note : actuator_notes(job.actuators)) outcome.notes.push_back(std::move(note));
-  const auto is_estimated = [](const Hyperparameter& h) { return h.is_system_parameter() && !h.is_fixed(); };
-  if (!job.actuators.empty() && std::ranges::any_of(result.report.hyperparameters, is_estimated)) {
-    std::vector<std::string> late;
-    for (const ActuatorEstimate& one : job.actuators) late.push_back(one.name);
-    outcome.notes.push_back(
-        fmt::format("standard errors of parameters take {} as known, and do not count the error of that", fmt::join(late, ", ")));
-  }
   outcome.file.report = std::move(result.report);
   outcome.file.take_data(outcome.posterior);
   outcome.file.report.actuators = job.actuators;

@@ -22,6 +22,7 @@
 #include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 #include "jobs/rollout.hpp"
+#include "prior/load_function.hpp"
 
 namespace gp2 {
 
@@ -217,12 +218,55 @@ VectorXd usual_state(const Prior& prior, const MatrixXd& states) {
   return states.col(nearest);
 }
 
+// What a latent is along its one direction that knows the load, as a friction coefficient: the force that was learned over the
+// direction under the mean load, on the coordinate where this is largest. Nothing where there is hardly a load.
+std::optional<LearnedForce> coefficient_of(const Posterior& posterior, const Latent& latent, const MatrixXd& states,
+                                           const LearnedForce& force) {
+  const auto* const load = dynamic_cast<const LoadFunction*>(latent.directions.get());
+  if (load == nullptr || latent.size() != 1 || latent.base != Latent::Base::force) return std::nullopt;
+  const VectorXd& parameters = posterior.values().parameters;
+  MatrixXd directions;
+  if (const StateFunction* const of_multipliers = load->of_multipliers()) {
+    const MatrixXd multipliers = posterior.mean(View::multipliers(*posterior.prior().system), states);
+    MatrixXd with_load(states.rows() + multipliers.rows(), states.cols());
+    with_load << states, multipliers;
+    directions = of_multipliers->evaluate(with_load, parameters);
+  } else {
+    directions = load->evaluate(states, parameters);
+  }
+  Index row = 0;
+  directions.rowwise().norm().maxCoeff(&row);
+  const VectorXd direction = directions.row(row).transpose();
+  std::vector<Index> loaded;
+  for (Index i = 0; i < direction.size(); ++i) {
+    if (std::abs(direction[i]) > 1e-3 * direction.cwiseAbs().maxCoeff()) loaded.push_back(i);
+  }
+  if (2 * std::ssize(loaded) < direction.size()) return std::nullopt;
+  LearnedForce out = force;
+  out.names = {"coefficient" + (force.names[0].find('@') == std::string::npos ? "" : "@" + latent.name)};
+  out.at = force.at(loaded);
+  out.mean = force.mean(std::vector<Index>{row}, loaded).cwiseQuotient(direction(loaded).transpose());
+  out.stddev = force.stddev(std::vector<Index>{row}, loaded).cwiseQuotient(direction(loaded).transpose().cwiseAbs());
+  return out;
+}
+
+// Those along the entries of the state that do most.
+void move_largest(std::vector<LearnedForce>& some, std::vector<LearnedForce>& all) {
+  constexpr std::ptrdiff_t most = 6;
+  constexpr double worth_a_look = 0.02;  // of what the entry does that does most
+  const auto effect = [](const LearnedForce& one) {
+    return (one.mean.rowwise().maxCoeff() - one.mean.rowwise().minCoeff()).norm();
+  };
+  std::ranges::stable_sort(some, std::greater(), effect);
+  const auto is_small = [&](const LearnedForce& one) { return !(effect(one) > worth_a_look * effect(some.front())); };
+  const std::ptrdiff_t n = std::min(most, std::ranges::find_if(some, is_small) - some.begin());
+  std::move(some.begin(), some.begin() + n, std::back_inserter(all));
+}
+
 }  // namespace
 
 std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
   constexpr Index n_points = 101;
-  constexpr std::size_t most = 6;        // entries of the state, of a latent
-  constexpr double worth_a_look = 0.02;  // of what the entry does that does most
   const Prior& prior = posterior.prior();
   const auto home = std::ranges::find_if(
       posterior.observations(), [](const Observations& group) { return !group.view().other_system && group.n_data() > 0; });
@@ -240,7 +284,7 @@ std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
     const std::vector<std::string> whole_names = view.names(*prior.system);
     view.latent = latents_called(prior, latent.name, "latent");
     const std::vector<std::string> names = has_several ? view.names(*prior.system, latent.name) : whole_names;
-    std::vector<LearnedForce> of_latent;
+    std::vector<LearnedForce> of_latent, coefficients;
     for (std::size_t k = 0; k < entries.size(); ++k) {
       const auto row = states.row(static_cast<Index>(k));
       if (!latent.features->reads(static_cast<int>(k)) || !(row.maxCoeff() > row.minCoeff())) continue;
@@ -250,17 +294,12 @@ std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
       try {
         const Posterior::Marginal marginal = posterior.marginal(view, along);
         of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev(), row.transpose()});
+        if (auto one = coefficient_of(posterior, latent, along, of_latent.back())) coefficients.push_back(*std::move(one));
       } catch (const InputError&) {  // where no data are a feature may have no value
       }
     }
-    const auto effect = [](const LearnedForce& one) {
-      return (one.mean.rowwise().maxCoeff() - one.mean.rowwise().minCoeff()).norm();
-    };
-    std::ranges::stable_sort(of_latent, std::greater(), effect);
-    const auto is_small = [&](const LearnedForce& one) { return !(effect(one) > worth_a_look * effect(of_latent.front())); };
-    const auto end = std::ranges::find_if(of_latent, is_small);
-    const auto n = std::min<std::size_t>(most, static_cast<std::size_t>(end - of_latent.begin()));
-    std::move(of_latent.begin(), of_latent.begin() + static_cast<std::ptrdiff_t>(n), std::back_inserter(all));
+    move_largest(of_latent, all);
+    move_largest(coefficients, all);
   }
   return all;
 }

@@ -268,7 +268,7 @@ std::string draws_text(const FitReport& report) {
   const double size = draws.effective_size.minCoeff(&slowest), r_hat = draws.r_hat.maxCoeff(&worst);
   const auto name = [&](Eigen::Index k) { return report.hyperparameters[static_cast<std::size_t>(k)].name; };
   return fmt::format(
-      "hyperparameters integrated: {} draws of {} chains, R̂ at most {:.3f} ({}), worth {:.0f} independent ones or more ({})\n",
+      "hyperparameters integrated: {} draws of {} chains, R̂ at most {:.4g} ({}), worth {:.0f} independent ones or more ({})\n",
       draws.size(), draws.n_chains, r_hat, name(worst), size, name(slowest));
 }
 
@@ -342,7 +342,7 @@ std::string text_of(const FitReport& report, const Model& model) {
     if (h.is_system_parameter()) {
       const ParameterUncertainty known = parameter_uncertainty(report, k);
       error = error_text(known.stddev);
-      if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.4g} … {:.4g})", known.mean, known.lower, known.upper);
+      if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.6g} … {:.6g})", known.mean, known.lower, known.upper);
     }
     text += estimate_line(h.name, h.value, error, unit_of(h, model), h.lower, h.upper,
                           h.is_fixed()   ? "   held"

@@ -4,6 +4,7 @@
 #include <cctype>
 #include <cmath>
 #include <functional>
+#include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -107,7 +108,8 @@ std::vector<Option> options(PlotRequest& request) {
       {"what", &request.what, "LATENT", "latent whose force is drawn", "what the data determine best"},
       {"along", &request.along, "NAME", "entry of the state along which, all others as in the most usual row",
        "the one that changes it most"},
-      {"force", &request.force, "COORDINATE", "coordinate on which the force acts", "what the data determine best"},
+      {"force", &request.force, "COORDINATE",
+       "coordinate on which the force acts, or `coefficient`, of friction that knows its load", "what the data determine best"},
   };
 }
 
@@ -129,7 +131,11 @@ LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& reques
   keep(curves, "`force`", request.force,
        [](const LearnedCurve& one) { return coordinate_of(one.force.names[static_cast<std::size_t>(one.row)]); });
   keep(curves, "`along`", request.along, [](const LearnedCurve& one) { return one.force.along; });
-  return *std::ranges::max_element(curves, {}, [](const LearnedCurve& one) { return clearness(one.force, one.row); });
+  // a coefficient says what was learned, the force what it is under one load
+  return *std::ranges::max_element(curves, {}, [](const LearnedCurve& one) {
+    return std::pair(one.force.names[static_cast<std::size_t>(one.row)].starts_with("coefficient"),
+                     clearness(one.force, one.row));
+  });
 }
 
 void require_name_of_svg(const std::filesystem::path& path) {
@@ -156,7 +162,7 @@ std::string plot(const LearnedCurve& curve, const Model& model) {
       "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{0}\" height=\"{1}\" viewBox=\"0 0 {0} {1}\" role=\"img\" "
       "font-family=\"system-ui, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif\" font-size=\"13\" fill=\"#59636b\">\n"
       "<title>{2}</title>\n"
-      "<desc>The force along {3}, with its 95 % band: from {4} to {5}. Marks at the foot are the {6} rows it was learned "
+      "<desc>What was learned along {3}, with its 95 % band: from {4} to {5}. Marks at the foot are the {6} rows it was learned "
       "from.</desc>\n"
       "<rect width=\"{0}\" height=\"{1}\" fill=\"#ffffff\"/>\n",
       width, height, markup_text(heading), markup_text(force.along), number_text(mean.minCoeff()), number_text(mean.maxCoeff()),

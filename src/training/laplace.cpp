@@ -127,22 +127,50 @@ bool draws_know_parameters(const FitReport& report) {
   return true;
 }
 
+// Under delays and lags that are known.
+double stddev_under_actuators(const FitReport& report, std::size_t k) {
+  const auto at = static_cast<Index>(k);
+  if (draws_know_parameters(report) && report.draws->is_drawn(at)) return report.draws->stddev[at];
+  return !report.uncertainty || report.hyperparameters[k].at_bound() ? not_a_number : report.uncertainty->stddev[at];
+}
+
+// What the errors of delays and lags add to the covariance of two parameters.
+double covariance_by_actuators(const FitReport& report, std::size_t k, std::size_t l) {
+  double sum = 0;
+  for (const ActuatorEstimate& one : report.actuators) {
+    const auto move = [&](std::size_t of) {
+      const auto found = one.moves.find(report.hyperparameters[of].name);
+      return found == one.moves.end() ? 0 : found->second;
+    };
+    sum += move(k) * move(l);
+  }
+  return sum;
+}
+
+double stddev_of_parameter(const FitReport& report, std::size_t k) {
+  return std::hypot(stddev_under_actuators(report, k), std::sqrt(covariance_by_actuators(report, k, k)));
+}
+
 }  // namespace
 
 ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k) {
-  const Hyperparameter& h = report.hyperparameters[k];
   const auto at = static_cast<Index>(k);
-  if (draws_know_parameters(report) && report.draws->is_drawn(at)) {
-    const HyperparameterDraws& draws = *report.draws;
-    return {true, draws.stddev[at], draws.mean[at], draws.lower[at], draws.upper[at]};
-  }
-  return {.stddev = !report.uncertainty || h.at_bound() ? not_a_number : report.uncertainty->stddev[at]};
+  const double stddev = stddev_of_parameter(report, k);
+  if (!draws_know_parameters(report) || !report.draws->is_drawn(at)) return {.stddev = stddev};
+  const HyperparameterDraws& draws = *report.draws;
+  const double mean = draws.mean[at], wider = stddev / draws.stddev[at];
+  return {true, stddev, mean, mean + wider * (draws.lower[at] - mean), mean + wider * (draws.upper[at] - mean)};
 }
 
 double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l) {
   const auto a = static_cast<Index>(k), b = static_cast<Index>(l);
-  if (draws_know_parameters(report)) return report.draws->correlation(a, b);
-  return report.uncertainty ? report.uncertainty->correlation(a, b) : not_a_number;
+  const bool is_of_draws = draws_know_parameters(report);
+  if (!is_of_draws && !report.uncertainty) return not_a_number;
+  const double correlation = is_of_draws ? report.draws->correlation(a, b) : report.uncertainty->correlation(a, b);
+  const double added = covariance_by_actuators(report, k, l);
+  if (added == 0) return correlation;
+  return (correlation * stddev_under_actuators(report, k) * stddev_under_actuators(report, l) + added) /
+         (stddev_of_parameter(report, k) * stddev_of_parameter(report, l));
 }
 
 namespace {

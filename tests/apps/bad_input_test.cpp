@@ -229,7 +229,7 @@ const std::vector<BadInput> bad_inputs = {
     {"GenerateNegativeNoise",
      nothing,
      "gp2 generate model.toml --n 5 --noise-std -1 -o old.csv",
-     {"--noise-std", "negative, got -1"}},
+     {"--noise-std: must be 0 … 1e+100, got -1"}},
     {"GenerateWithoutTruth", model_with("[truth]", "[unused]"), "gp2 generate model.toml --n 5 -o old.csv", {"model.toml"}},
     // the fit
     {"FitOfANewerFormat",

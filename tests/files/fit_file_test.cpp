@@ -236,7 +236,7 @@ u  = [-1, 1]
                                     "cart"));
   constexpr double infinity = std::numeric_limits<double>::infinity(), nan = std::numeric_limits<double>::quiet_NaN();
   for (const double stddev : {0.001, infinity, nan}) {
-    fit.report.actuators = {{"u.delay", 0.02, stddev, 0, 0.1}, {"u.lag", 0.03, 0.002, 0, 0.2}};
+    fit.report.actuators = {{"u.delay", 0.02, stddev, 0, 0.1}, {"u.lag", 0.03, 0.002, 0, 0.2, {{"m", -0.1}}}};
     const std::vector<ActuatorEstimate> read = written_and_read(fit).report.actuators;
     ASSERT_EQ(read.size(), 2U);
     EXPECT_TRUE(read[0].stddev == stddev || (std::isnan(read[0].stddev) && std::isnan(stddev))) << stddev;
@@ -244,6 +244,7 @@ u  = [-1, 1]
               std::tie(fit.report.actuators[0].name, fit.report.actuators[0].value, fit.report.actuators[0].lower,
                        fit.report.actuators[0].upper));
     EXPECT_EQ(read[1].stddev, 0.002);
+    EXPECT_EQ(read[1].moves, fit.report.actuators[1].moves);
   }
 }
 

@@ -11,6 +11,7 @@
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/raw_fit.hpp"
+#include "gp2/training/laplace.hpp"
 #include "input_error.hpp"
 #include "io_testing.hpp"
 #include "jobs/late_cart.hpp"
@@ -120,6 +121,31 @@ TEST(ActuatorFit, AFitKeepsItsEstimatesInItsFileAndIsDoneAgainFromThere) {
   const FitOutcome again = run_fit(prepare_fit_again(read));
   EXPECT_EQ(again.file.report.objective, fit.file.report.objective);
   EXPECT_EQ(again.file.model.actuators[0].delay.value, read.model.actuators[0].delay.value);
+}
+
+TEST(ActuatorFit, CountsWhatAnErrorOfALagMakesOfAMass) {
+  const CsvTable log = late_cart_log(0, 0.04, 100, 6, 8);
+  const auto fit_with = [&](const std::string& lag) {
+    FitRequest request = request_for(R"("u")", log);
+    request.model = late_cart(fmt::format("{{ name = \"u\", lag = {} }}", lag), /*estimates_mass=*/true);
+    return run_fit(prepare_fit(std::move(request))).file.report;
+  };
+  const auto mass_of = [](const FitReport& report) {
+    return std::ranges::find(report.hyperparameters, "m", &Hyperparameter::name) - report.hyperparameters.begin();
+  };
+  const FitReport report = fit_with("{ estimate = true }");
+  const ActuatorEstimate& lag = report.actuators.front();
+  const auto m = mass_of(report);
+  const auto mass_at = [&](double value) {
+    const FitReport there = fit_with(fmt::format("{}", value));
+    return there.hyperparameters[static_cast<std::size_t>(mass_of(there))].value;
+  };
+  const double move = (mass_at(lag.value + lag.stddev) - mass_at(lag.value - lag.stddev)) / 2;
+  EXPECT_NEAR(lag.moves.at("m"), move, 0.2 * std::abs(move));
+  const double of_mass = report.uncertainty->stddev[m];
+  EXPECT_DOUBLE_EQ(parameter_uncertainty(report, static_cast<std::size_t>(m)).stddev, std::hypot(of_mass, lag.moves.at("m")));
+  EXPECT_GT(std::abs(move), 0.1 * of_mass);
+  EXPECT_NEAR(parameter_correlation(report, static_cast<std::size_t>(m), static_cast<std::size_t>(m)), 1, 1e-14);
 }
 
 TEST(ActuatorFit, FromARawLogToo) {

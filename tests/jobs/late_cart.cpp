@@ -10,13 +10,15 @@
 
 namespace gp2::test {
 
-Model late_cart(const std::string& input) {
+Model late_cart(const std::string& input, bool estimates_mass) {
   return Model::parse(fmt::format(R"toml(
 name = "cart"
 coordinates = ["x"]
 inputs = [{}]
+[parameters]
+m = {{ value = 1.5, bounds = [0.5, 5], estimate = {} }}
 [mechanics]
-mass = [[1.5]]
+mass = [["m"]]
 force = ["u"]
 [[latent]]
 name = "friction"
@@ -27,7 +29,7 @@ ddq = 0.05
 [truth]
 force = ["-2*dx - tanh(5*dx)"]
 )toml",
-                                  input),
+                                  input, estimates_mass),
                       "late_cart.toml");
 }
 

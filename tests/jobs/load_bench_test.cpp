@@ -1,4 +1,5 @@
 // Friction μ(v)|λ₀| of two machines: what a direction that knows the load gains, and that it holds beyond the data.
+#include <algorithm>
 #include <cmath>
 
 #include <fmt/format.h>
@@ -6,6 +7,7 @@
 
 #include "data_of_model.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/report_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "test_models.hpp"
 
@@ -115,6 +117,23 @@ TEST_P(FrictionOfAChangedLoad, IsLearnedTogetherWithIt) {
     covered += own.coverage;
   }
   EXPECT_GE(covered / static_cast<double>(seeds.size()), 0.8);
+}
+
+// 0.15 + 0.25 exp(−(v/0.4)²): at the ends of the speeds what is left of it at speed
+TEST(FrictionOfALoadAsACurve, IsItsCoefficient) {
+  Machine machine;
+  machine.file = "experiments/mechanisms/rubbing_bead.toml";
+  const std::vector<LearnedForce> all = learned_forces(fitted(test::model(machine.file), machine, 60, 41));
+  const auto curve = std::ranges::find_if(
+      all, [](const LearnedForce& one) { return one.names == std::vector<std::string>{"coefficient"} && one.along == "dx"; });
+  ASSERT_NE(curve, all.end());
+  for (const Eigen::Index end : {Eigen::Index{0}, curve->at.size() - 1}) {
+    EXPECT_GT(std::abs(curve->at[end]), 1.2);
+    EXPECT_NEAR(curve->mean(0, end), 0.15, 3 * curve->stddev(0, end) + 1e-3);
+  }
+  EXPECT_GT(curve->mean.minCoeff(), 0.13);
+  EXPECT_LT(curve->mean.maxCoeff(), 0.42);
+  EXPECT_LT(curve->stddev.maxCoeff(), 0.05);
 }
 
 }  // namespace

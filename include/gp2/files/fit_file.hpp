@@ -23,8 +23,7 @@ namespace gp2 GP2_API {
 struct FitFile {
   /// An empty one, for who fills in its members.
   FitFile() = default;
-  /// The file of a fit, of which file.posterior() is the posterior. As make_prior, not to be called from several threads for one
-  /// model.
+  /// The file of a fit, of which file.posterior() is the posterior.
   ///
   /// @param prior_options  that the prior of the fit was made with
   /// @param systems        as the member

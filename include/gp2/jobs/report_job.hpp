@@ -31,10 +31,10 @@ struct Relevance {
 };
 
 /// The force that a latent adds to F along one entry of the state, mean and standard deviation. All other entries are as in one row
-/// of the training data, the nearest to their medians.
+/// of the training data, the nearest to their medians. Or what it is along one direction that knows the load: a coefficient.
 struct LearnedForce {
   std::string latent, along;
-  std::vector<std::string> names;  // force_NAME, with @LATENT behind where there are several (d)
+  std::vector<std::string> names;  // force_NAME, or `coefficient`; with @LATENT behind where there are several (d)
   Eigen::VectorXd at;              // evenly over what the training data hold (n)
   Eigen::MatrixXd mean, stddev;    // (d × n)
   Eigen::VectorXd data;            // where the training data are (N)
