@@ -10,6 +10,7 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <Eigen/Eigenvalues>
 
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
@@ -180,6 +181,22 @@ std::optional<double> offset(const Steps& steps) {
   return o;
 }
 
+// That a rate does not explain what is measured, and noise of neither of them hides it: of the right rate y = s x + noise for some s,
+// and noise does not go on from step to step. The least that any y − s x goes on is an eigenvalue.
+std::string unrelated(const Steps& steps) {
+  constexpr double much = 0.1, lasting = 0.5;  // share of the squares; correlation from step to step
+  const double unexplained = 1 - std::pow(steps.correlation(), 2);
+  if (steps.n() < enough_steps || !(unexplained > much)) return "";
+  Eigen::MatrixX2d both(steps.n(), 2);
+  both << steps.y.matrix().normalized(), steps.x.matrix().normalized();
+  const Index n = steps.n() - 1;
+  const Eigen::Matrix2d at_once = both.transpose() * both, next = both.topRows(n).transpose() * both.bottomRows(n);
+  const Eigen::GeneralizedSelfAdjointEigenSolver<Eigen::Matrix2d> least((next + next.transpose()) / 2, at_once,
+                                                                        Eigen::EigenvaluesOnly);
+  if (!(least.eigenvalues()[0] > lasting)) return "";
+  return fmt::format("{:.0f} % of what is measured is neither it nor noise: another column?", 100 * unexplained);
+}
+
 }  // namespace
 
 std::string better_rate(const RateColumns& columns) {
@@ -233,8 +250,8 @@ std::string better_rate(const RateColumns& columns) {
     }
     return fmt::format("{}", fmt::join(texts, "; "));
   }
-  if (std::abs(now.correlation()) < 0.5) return other_column([](const Steps&) { return true; });
-  return "";
+  const std::string other = std::abs(now.correlation()) < 0.5 ? other_column([](const Steps&) { return true; }) : "";
+  return other.empty() ? unrelated(now) : other;
 }
 
 std::vector<std::string> wrong_rates(const System& system, const Ref<const MatrixXd>& states,

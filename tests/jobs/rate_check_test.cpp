@@ -152,7 +152,25 @@ TEST(RateCheck, AnotherColumnIsNamed) {
   const std::vector<std::string> names = {"dx", "dy"};
   EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), HasSubstr("dx: swapped?"));
   rates[0].segment(300, 100).setConstant(not_a_number);
-  EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), IsEmpty()) << "a column with gaps is not offered";
+  EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), Not(HasSubstr("swapped"))) << "a column with gaps";
+}
+
+// no column is the right one: a copy of the coordinate stands for its rate
+TEST(RateCheck, AColumnThatIsNoRateIsNamedWhateverItIs) {
+  const Index n = 2000;
+  for (const double noise : {0.0, 0.02}) {
+    std::mt19937 random(5);
+    std::normal_distribution<double> normal(0, noise);
+    RowVectorXd t(n), value(n), copy(n);
+    for (Index i = 0; i < n; ++i) {
+      t[i] = 0.01 * static_cast<double>(i);
+      const double exact = std::sin(2 * t[i]) + std::cos(0.9 * t[i] * (1 + 0.02 * t[i])) - std::exp(-t[i]);
+      value[i] = exact + normal(random);
+      copy[i] = exact + normal(random);
+    }
+    const std::vector<std::string> names = {"dx"};
+    EXPECT_THAT(better_rate({t, "x", value, false, {copy}, names, 0}), HasSubstr("is neither it nor noise")) << noise;
+  }
 }
 
 TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {
