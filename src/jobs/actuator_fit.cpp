@@ -316,7 +316,7 @@ class ActuatorTraining {
       const Hyperparameter& h = problem_.hyperparameters[static_cast<std::size_t>(k)];
       if (!h.is_system_parameter()) continue;
       for (Index f = 0; f < std::ssize(free); ++f)
-        out[static_cast<std::size_t>(free[static_cast<std::size_t>(f)])].moves.emplace(h.name, moves(k, f));
+        out[static_cast<std::size_t>(free[static_cast<std::size_t>(f)])].moves.emplace(h.name, h.map().unit * moves(k, f));
     }
     return out;
   }

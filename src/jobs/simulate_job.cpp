@@ -14,6 +14,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/model_motion.hpp"
 #include "jobs/read_observations.hpp"
+#include "simulation/contacts.hpp"
 
 namespace gp2 {
 
@@ -120,6 +121,33 @@ void free_what_depends(const Model& model, const VectorXd& parameters, StartingP
   std::copy(is_measured.begin(), is_measured.end(), start.given.begin());
 }
 
+// What is not given follows from the constraints; where that would be below the surface of a contact, from the contact too.
+VectorXd complete_above_surfaces(const Model& model, const VectorXd& parameters, const StartingPoint& start,
+                                 std::vector<std::string>& notes) {
+  constexpr double rounding = 1e-9;
+  const System& system = *model.system;
+  const std::vector<Contact> contacts = contacts_of(model, parameters);
+  std::vector<std::string> said;
+  VectorXd state = complete_start(model, parameters, start, said);
+  const MatrixXd gaps = gaps_of(system, contacts, state, parameters);
+  StartingPoint touching = start;
+  for (std::size_t k = 0; k < contacts.size(); ++k) {
+    if (gaps(static_cast<Index>(k), 0) < 0) touching.state[system.layout().u(contacts[k].input)] = 1;
+  }
+  if ((gaps.array() < 0).any()) {
+    std::vector<std::string> on_surface;
+    VectorXd there = complete_start(model, parameters, touching, on_surface);
+    const bool is_solved = std::ranges::none_of(on_surface, [](const std::string& note) { return note.starts_with("warning"); });
+    if (is_solved && gaps_of(system, contacts, there, parameters).minCoeff() > -rounding) {
+      state = std::move(there);
+      state.tail(system.layout().nu) = start.state.tail(system.layout().nu);  // which contacts are closed the motion tells
+      said = std::move(on_surface);
+    }
+  }
+  notes.insert(notes.end(), said.begin(), said.end());
+  return state;
+}
+
 VectorXd start_state(const Model& model, const VectorXd& parameters, const SimulateRequest& request,
                      const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
   const System& system = *model.system;
@@ -130,7 +158,7 @@ VectorXd start_state(const Model& model, const VectorXd& parameters, const Simul
                  request.start);
   start.state[system.layout().t()] = request.times[0];
   if (std::holds_alternative<CsvTable>(request.start)) free_what_depends(model, parameters, start);
-  return complete_start(model, parameters, std::move(start), notes);
+  return complete_above_surfaces(model, parameters, start, notes);
 }
 
 // Inputs must cover the motion: they are not extrapolated.

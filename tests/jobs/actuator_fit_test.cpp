@@ -128,6 +128,7 @@ TEST(ActuatorFit, CountsWhatAnErrorOfALagMakesOfAMass) {
   const auto fit_with = [&](const std::string& lag) {
     FitRequest request = request_for(R"("u")", log);
     request.model = late_cart(fmt::format("{{ name = \"u\", lag = {} }}", lag), /*estimates_mass=*/true);
+    request.thin = false;
     return run_fit(prepare_fit(std::move(request))).file.report;
   };
   const auto mass_of = [](const FitReport& report) {
@@ -137,7 +138,7 @@ TEST(ActuatorFit, CountsWhatAnErrorOfALagMakesOfAMass) {
   const ActuatorEstimate& lag = report.actuators.front();
   const auto m = mass_of(report);
   const auto mass_at = [&](double value) {
-    const FitReport there = fit_with(fmt::format("{}", value));
+    const FitReport there = fit_with(fmt::format("{{ estimate = true, prior = {{ mean = {}, stddev = 1e-7 }} }}", value));
     return there.hyperparameters[static_cast<std::size_t>(mass_of(there))].value;
   };
   const double move = (mass_at(lag.value + lag.stddev) - mass_at(lag.value - lag.stddev)) / 2;

@@ -213,6 +213,32 @@ TEST(StartOfALog, OfRoundedCoordinatesSolvesForTheOthersNearThem) {
   EXPECT_THAT(job.notes, Contains(HasSubstr("; the nearest that has one is x = 0.789")));
 }
 
+// z = 0, which is taken where it is not given, may be inside the hill
+TEST(StartByNames, IsOnTheSurfaceThatItWouldBeBelow) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "z"]
+inputs = ["touch"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "-9.81"]
+[constraints]
+position = [{ expr = "z - 0.3*cos(3*x)", contact = "touch" }]
+)toml",
+                                   "hill.toml");
+  const auto start_at = [&](std::map<std::string, double> given) {
+    SimulateRequest request;
+    request.start = std::move(given);
+    request.times = VectorXd::LinSpaced(2, 0, 0.1);
+    return prepare_simulation(model, request).start;
+  };
+  const VectorXd on_hill = start_at({{"x", -0.5}, {"dx", 2.5}});
+  EXPECT_NEAR(on_hill[1], 0.3 * std::cos(1.5), 1e-12);
+  EXPECT_NEAR(on_hill[3], 0.9 * std::sin(1.5) * 2.5, 1e-12);
+  EXPECT_EQ(on_hill[5], 0) << "the motion tells whether they touch";
+  EXPECT_EQ(start_at({{"x", 1}})[1], 0) << "in the air";
+  EXPECT_EQ(start_at({{"x", -0.5}, {"z", 0}})[1], 0) << "as given, which the motion refuses";
+}
+
 // an angle of many turns where that is the solution
 TEST(StartOfALog, MayBeManyTurnsAway) {
   const Model model = Model::parse(R"toml(
