@@ -88,9 +88,12 @@ bool is_covered(const Samples& samples, const WindowGrid& grid, const Window& wi
 bool has_states(const Samples& samples, const WindowGrid& grid, const Window& window, const VectorXd& times) {
   const double begin = samples.time[static_cast<std::size_t>(window.first - 1)];
   const double end = samples.time[static_cast<std::size_t>(window.first + window.b.size())];
-  const Index n = times.size();
-  const Index first = std::max<Index>(0, std::upper_bound(times.begin(), times.end(), begin) - times.begin() - 1);
-  const Index last = std::min<Index>(n - 1, std::lower_bound(times.begin(), times.end(), end) - times.begin());
+  // from the one before the window to the one after it, where these are near; else it may reach beyond them by a step
+  Index first = std::upper_bound(times.begin(), times.end(), begin) - times.begin() - 1;
+  Index last = std::lower_bound(times.begin(), times.end(), end) - times.begin();
+  const auto is_far = [&](Index i) { return i < 0 || i + 1 >= times.size() || times[i + 1] - times[i] > grid.spacing; };
+  if (is_far(first)) ++first;
+  if (is_far(last - 1)) --last;
   if (last <= first) return false;
   for (Index i = first; i < last; ++i) {
     if (times[i + 1] - times[i] > grid.spacing) return false;
