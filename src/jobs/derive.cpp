@@ -472,16 +472,43 @@ class Deriver {
     }
   }
 
-  // each input goes through the filter of the slowest coordinate: a smoother of the same spectrum and noise is that filter
+  // The coordinates whose applied force reads an input, at states of no special place; all where that is not known.
+  [[nodiscard]] std::vector<bool> driven_by(std::size_t input) const {
+    constexpr Index n = 3;
+    const StateLayout layout = system_.layout();
+    MatrixXd states(layout.size(), 2 * n);
+    for (Index k = 0; k < states.rows(); ++k) {
+      for (Index i = 0; i < n; ++i) states(k, i) = states(k, n + i) = 0.7 * std::sin(1.0 + static_cast<double>(k + 11 * i));
+    }
+    states.row(layout.u(static_cast<int>(input))).tail(n).array() += 1;
+    std::vector<bool> driven(static_cast<std::size_t>(layout.nq), true);
+    try {
+      const MatrixXd force = system_.evaluate(states, system_.parameter_values()).force;
+      const MatrixXd change = force.rightCols(n) - force.leftCols(n);
+      if (!change.allFinite()) return driven;
+      for (Index j = 0; j < change.rows(); ++j) driven[static_cast<std::size_t>(j)] = !change.row(j).isZero(0);
+    } catch (const InputError&) {  // code that is not defined there
+    }
+    return driven;
+  }
+
+  // each input goes through the filter of the slowest coordinate that it drives: a smoother of the same spectrum and noise is that filter
   void add_inputs() {
     for (std::size_t u = 0; u < system_.inputs().size(); ++u) {
       if (!raw_.has_input(u)) continue;
+      const std::vector<bool> driven = driven_by(u);
       for (int e = 0; e < std::ssize(episodes_); ++e) {
         const Episode& episode = episode_of(e);
-        const DerivedSeries* slowest = nullptr;
-        for (const DerivedSeries& series : data_.series) {
-          if (series.episode == e && (!slowest || series.bandwidth < slowest->bandwidth)) slowest = &series;
-        }
+        const auto slowest_of = [&](bool those_driven) {
+          const DerivedSeries* slowest = nullptr;
+          for (const DerivedSeries& series : data_.series) {
+            if (series.episode != e || (those_driven && !driven[static_cast<std::size_t>(series.coordinate)])) continue;
+            if (!slowest || series.bandwidth < slowest->bandwidth) slowest = &series;
+          }
+          return slowest;
+        };
+        const DerivedSeries* slowest = slowest_of(/*those_driven=*/true);
+        if (!slowest) slowest = slowest_of(/*those_driven=*/false);
         const Channel channel = raw_.input(u, episode);
         const VectorXd times = times_to_write(episode);
         const Index first = first_row_[static_cast<std::size_t>(e)];
