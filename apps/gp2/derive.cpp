@@ -69,7 +69,7 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
   add_if_any(&DerivedSeries::noise_at_least, "noise at that of rounding");
   add_if_any(&DerivedSeries::noise_unseen,
              "no noise seen: there is none, as in a simulated log, or the motion is too fast for these samples to tell it "
-             "from, and the deviation of the positions is too small");
+             "from, and then the standard deviation of the positions is too small");
   if (!counts.empty()) text += fmt::format("; {}", fmt::join(counts, ", "));
   return text;
 }

@@ -109,7 +109,6 @@ class Observations {
   [[nodiscard]] Observations with_sums(std::vector<WeightedSum> sums) const;
   /// @throws InputError where there are some.
   void require_no_sums() const;
-  [[nodiscard]] Observations without_sums() const { return {states_, view_, values_, noise_}; }
 
   /// These states, in this order. @throws InputError where there are sums, as append() and remove_first() do.
   [[nodiscard]] Observations take(const std::vector<int>& states) const;

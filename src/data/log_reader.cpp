@@ -104,9 +104,9 @@ const char* LogReader::mend_for_missing(const std::string& name) const {
     return is_of_kind && !has_one;
   };
   if (lacks_all([](const Coordinate& one) { return one.acceleration(); }))
-    return "It has no accelerations: gp2 derive computes them from positions over time, as gp2 fit --raw does; or";
+    return "It has no accelerations: gp2 derive computes them from positions over time, as a fit of a raw log does; or";
   if (lacks_all([](const Coordinate& one) { return one.velocity(); }))
-    return "It has no velocities: gp2 derive computes them from positions over time, as gp2 fit --raw does; or";
+    return "It has no velocities: gp2 derive computes them from positions over time, as a fit of a raw log does; or";
   return "Rename it, or";
 }
 

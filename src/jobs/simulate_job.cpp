@@ -127,7 +127,7 @@ VectorXd complete_above_surfaces(const Model& model, const VectorXd& parameters,
   constexpr double rounding = 1e-9;
   const System& system = *model.system;
   const std::vector<Contact> contacts = contacts_of(model, parameters);
-  std::vector<std::string> said;
+  std::vector<std::string> said, said_on_surface;
   VectorXd state = complete_start(model, parameters, start, said);
   const MatrixXd gaps = gaps_of(system, contacts, state, parameters);
   StartingPoint touching = start;
@@ -135,13 +135,12 @@ VectorXd complete_above_surfaces(const Model& model, const VectorXd& parameters,
     if (gaps(static_cast<Index>(k), 0) < 0) touching.state[system.layout().u(contacts[k].input)] = 1;
   }
   if ((gaps.array() < 0).any()) {
-    std::vector<std::string> on_surface;
-    VectorXd there = complete_start(model, parameters, touching, on_surface);
-    const bool is_solved = std::ranges::none_of(on_surface, [](const std::string& note) { return note.starts_with("warning"); });
-    if (is_solved && gaps_of(system, contacts, there, parameters).minCoeff() > -rounding) {
-      state = std::move(there);
-      state.tail(system.layout().nu) = start.state.tail(system.layout().nu);  // which contacts are closed the motion tells
-      said = std::move(on_surface);
+    VectorXd on_surface = complete_start(model, parameters, touching, said_on_surface);
+    const bool is_solved =
+        std::ranges::none_of(said_on_surface, [](const std::string& note) { return note.starts_with("warning"); });
+    if (is_solved && gaps_of(system, contacts, on_surface, parameters).minCoeff() > -rounding) {
+      state.head(2 * system.nq()) = on_surface.head(2 * system.nq());  // which contacts are closed the motion tells
+      said = std::move(said_on_surface);
     }
   }
   notes.insert(notes.end(), said.begin(), said.end());

@@ -134,15 +134,17 @@ TEST_F(LogReaderTest, TwoCoordinatesMayTradeNames) {
 }
 
 TEST_F(LogReaderTest, AMissingColumnIsRefusedWithWhatWasTriedAndWhatThereIs) {
-  EXPECT_EQ(input_error_of([&] { state("q1,remark\n1,x\n", "dq2"); }),
-            "log.csv: missing column 'dq2' (looked for dq2, qd2, v2, qvel2, q2_dot); the file has: q1, remark. It has no "
-            "velocities: gp2 derive computes them from positions over time, as gp2 fit --raw does; or give `map=LOGNAME=dq2`");
+  EXPECT_EQ(
+      input_error_of([&] { state("q1,remark\n1,x\n", "dq2"); }),
+      "log.csv: missing column 'dq2' (looked for dq2, qd2, v2, qvel2, q2_dot); the file has: q1, remark. It has no "
+      "velocities: gp2 derive computes them from positions over time, as a fit of a raw log does; or give `map=LOGNAME=dq2`");
   // others are there: this one may have another name
   EXPECT_THAT(input_error_of([&] { state("q1,dq1,omega\n1,2,3\n", "dq2"); }), HasSubstr("omega. Rename it, or give `map="));
   EXPECT_THAT(input_error_of([&] { state("dq1\n1\n", "q2"); }), HasSubstr("dq1. Rename it, or give `map="));
-  EXPECT_THAT(input_error_of([&] { value("q1,q2,dq1,dq2\n1,2,3,4\n", "ddq1"); }),
-              HasSubstr("It has no accelerations: gp2 derive computes them from positions over time, as gp2 fit --raw does; or "
-                        "give `map=LOGNAME=ddq1`"));
+  EXPECT_THAT(
+      input_error_of([&] { value("q1,q2,dq1,dq2\n1,2,3,4\n", "ddq1"); }),
+      HasSubstr("It has no accelerations: gp2 derive computes them from positions over time, as a fit of a raw log does; or "
+                "give `map=LOGNAME=ddq1`"));
   EXPECT_THAT(input_error_of([&] {
                 state("q1\n1\n", "q2", {{"q2", "theta"}});
               }),

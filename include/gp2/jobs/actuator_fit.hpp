@@ -9,7 +9,7 @@
 namespace gp2 GP2_API {
 
 /// The delays and lags that a problem wants estimated (FitProblem::late), by the posterior density of them and the hyperparameters
-/// together: at most so large a reduced problem, of rows evenly taken, tells.
+/// together: of rows at most so large a reduced problem, evenly taken, tells, of windows of time all.
 inline constexpr int largest_actuator_size = 400;
 
 /// Finds where delays, lags and hyperparameters together are likeliest. The box of each delay and lag is scanned first and last, since
