@@ -121,9 +121,9 @@ MotionStart read_start(const std::string& text) {
 }
 
 Option start_option(std::string& value) {
-  return required({"start", &value, "NAME=VALUE,… or CSV",
-                   "coordinates and velocities, or a CSV whose first row is taken. What is not given follows from the "
-                   "constraints, or is 0"});
+  return required(
+      {"start", &value, "NAME=VALUE,… or CSV",
+       "coordinates and velocities, or a CSV whose first row is used; values not given follow from the constraints or are 0"});
 }
 
 void require_output(const std::string& output, const std::vector<std::string>& inputs, const char* option) {

@@ -62,15 +62,14 @@ void run(const CheckArguments& arguments) {
 
 Command check_command() {
   const auto a = std::make_shared<CheckArguments>();
-  return {
-      "check",
-      "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns",
-      "gp2 check models/double_pendulum.toml --data train.csv",
-      joined({{argument("MODEL", a->model, "model file"),
-               {"data", &a->data, "CSV", "CSV log", "states of the model's [sampling] or [motion]"}},
-              options(a->options),
-              {{"json", &a->json, "", "findings as JSON on stdout"}}}),
-      [a](const std::set<std::string>&) { run(*a); }};
+  return {"check",
+          "Check a model, and a log against it: rank, definiteness, derivatives, constraint residuals, dependent columns",
+          "gp2 check models/double_pendulum.toml --data train.csv",
+          joined({{argument("MODEL", a->model, "model file"),
+                   {"data", &a->data, "CSV", "CSV log", "states of the model's [sampling] or [motion]"}},
+                  options(a->options),
+                  {{"json", &a->json, "", "print the findings as JSON"}}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

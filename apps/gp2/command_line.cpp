@@ -175,7 +175,7 @@ class Parsing {
       }
       const std::size_t colon = text.find(":-"), place = colon == std::string::npos ? 0 : colon + 1;
       if (text.substr(place) != "-" && !text.substr(place).starts_with("-@")) return;
-      if (option.name == "checkpoint") throw UsageError{"--checkpoint - is written again and again: name a file"};
+      if (option.name == "checkpoint") throw UsageError{"--checkpoint is rewritten repeatedly: name a file instead of -"};
       text.replace(place, 1, "/dev/stdin");
       ++n_read;
     };
@@ -341,7 +341,7 @@ std::string markdown_table(const Command& command) {
       if (!otherwise.empty() && !words_of(option).empty()) otherwise = "`" + otherwise + "`";
     }
     std::string text = with_flags(option.text);
-    if (std::holds_alternative<YesByDefault>(option.value)) text = "leaves out " + text;
+    if (std::holds_alternative<YesByDefault>(option.value)) text = "leave out " + text;
     table += fmt::format("| {} | {} | {} |\n", usage, otherwise, with_links(text));
   }
   return table;

@@ -51,12 +51,12 @@ void run(const CompletionArguments& arguments) {
 Command completion_command() {
   const auto a = std::make_shared<CompletionArguments>();
   Option shell{"shell", choice(a->shell, {{"bash", "bash"}, {"zsh", "zsh"}, {"fish", "fish"}, {"all", "all"}}), "",
-               "bash, zsh, fish; all: every one of them and the man pages, into the folders below -o"};
+               "shell; all: the scripts of all shells and the man pages, written below -o"};
   shell.flag = "SHELL";
   Option folder = output(a->output, "DIR", "folder like /usr/local/share or ~/.local/share");
   folder.is_required = false;
   return {"completion",
-          "Print the script that lets a shell complete commands and options, or write those of all shells and the man pages",
+          "Print the completion script of a shell, or write those of all shells and the man pages",
           "source <(gp2 completion bash)\n"
           "gp2 completion fish > ~/.config/fish/completions/gp2.fish\n"
           "gp2 completion all -o ~/.local/share",
@@ -68,7 +68,7 @@ Command help_command(const std::vector<std::string>& names) {
   const auto name = std::make_shared<std::string>();
   std::vector<std::pair<std::string, std::string>> words;
   for (const std::string& one : names) words.emplace_back(one, one);
-  Option of{"command", choice(*name, words), "", "a command; without it all are listed"};
+  Option of{"command", choice(*name, words), "", "command to explain; without it all are listed"};
   of.flag = "COMMAND";
   const auto run = [name](const std::set<std::string>&) {
     const std::vector<Command> commands = all_commands();

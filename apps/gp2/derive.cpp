@@ -52,7 +52,7 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
   if (const int n = total(&DerivedSeries::repeated); n > 0) counts.push_back(fmt::format("{} repeated", n));
   if (const int n = total(&DerivedSeries::missing); n > 0) counts.push_back(fmt::format("{} missing", n));
   if (const int n = total(&DerivedSeries::wraps); n > 0)
-    counts.push_back(count_of(n, "jump of 2π taken out", "jumps of 2π taken out"));
+    counts.push_back(count_of(n, "jump of 2π removed", "jumps of 2π removed"));
   if (const int n = total(&DerivedSeries::gaps); n > 0) {
     double longest = 0;
     for (const DerivedSeries* one : series) longest = std::max(longest, one->longest_gap);
@@ -68,8 +68,8 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
   };
   add_if_any(&DerivedSeries::noise_at_least, "noise at that of rounding");
   add_if_any(&DerivedSeries::noise_unseen,
-             "no noise seen: there is none, as in a simulated log, or the motion is too fast for these samples to tell it "
-             "from, and then the standard deviation of the positions is too small");
+             "no noise seen: the log is simulated, or the motion is too fast to be distinguished from noise, and then the "
+             "standard deviation of the positions is too small");
   if (!counts.empty()) text += fmt::format("; {}", fmt::join(counts, ", "));
   return text;
 }
@@ -111,12 +111,11 @@ Command derive_command() {
   const auto a = std::make_shared<DeriveArguments>();
   return {"derive", "Smooth a raw log of positions into velocities and accelerations for a fit",
           "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv",
-          joined({{argument("LOG", a->log, "CSV of t and positions, and of velocities and inputs where there are"),
+          joined({{argument("LOG", a->log, "CSV with t and positions, optionally velocities and inputs"),
                    required({"model", &a->model, "MODEL", "model file"}),
                    {"like", &a->like, "LOG",
-                    "another raw log: smooth this one by the models found for that one, so that what is learned from one and "
-                    "tested on the other has gone through one filter",
-                    "models of its own"}},
+                    "use the smoothing models of this other raw log, so that training and test data pass through the same filter",
+                    "the log's own models"}},
                   options(a->options),
                   {output(a->output, "CSV", "CSV file to write")}}),
           [a](const std::set<std::string>&) { run(*a); }};

@@ -117,7 +117,7 @@ Command evaluate_command() {
                    required({"data", &a->data, "CSV", "CSV with states and accelerations"}),
                    {"system", &a->system, "OTHER.toml", system_help}},
                   options(a->request),
-                  {{"json", &a->json, "", "figures as JSON on stdout"}}}),
+                  {{"json", &a->json, "", "print the scores as JSON"}}}),
           [a](const std::set<std::string>&) { run(*a); }};
 }
 

@@ -66,14 +66,14 @@ std::vector<std::string> notes_of(const Excitation& found, const ExciteArguments
   std::vector<std::string> notes = found.notes;
   for (const Excitation::Known& one : found.parameters) notes.push_back(known_text(one));
   for (const Excitation::Known& one : found.accelerations) {
-    notes.push_back(known_text(one) + ", root mean square where motions within the limits go");
+    notes.push_back(known_text(one) + ", rms over motions within the limits");
   }
   if (found.n_random == 0) {
-    notes.emplace_back("no random motion stays within the limits, to compare with");
+    notes.emplace_back("no random motion stays within the limits for comparison");
   } else {
     notes.push_back(
-        fmt::format("all in all deviations fall to {:.3g} of what they are; to {:.3g} by a random motion, the median of "
-                    "{}, each as large as the limits allow",
+        fmt::format("overall, standard deviations fall to {:.3g} of their present values; with a random motion to {:.3g}, the "
+                    "median of {}, each as large as the limits allow",
                     found.factor, found.random_factor, found.n_random));
   }
   for (const Excitation::LimitUse& one : found.limits) {
@@ -82,8 +82,8 @@ std::vector<std::string> notes_of(const Excitation& found, const ExciteArguments
   }
   if (found.leaves_data) {
     notes.push_back(
-        fmt::format("warning: the motion leaves the region of the data at t = {:.6g}, where the fit knows little of where "
-                    "it goes: leave room in the limits, and plan again from a fit with what it measured",
+        fmt::format("warning: the motion leaves the region of the data at t = {:.6g}, where its prediction is uncertain: leave a "
+                    "margin in the limits, and plan again after a fit with the new measurements",
                     *found.leaves_data));
   }
   notes.push_back(fmt::format(
@@ -95,7 +95,8 @@ std::vector<std::string> notes_of(const Excitation& found, const ExciteArguments
 void print_search(const ExciteProgress& p) {
   if (!progress_is_due()) return;
   const double left = p.seconds * (p.n_all - p.n_motions) / p.n_motions;
-  const std::string best = std::isnan(p.best) ? "none within the limits yet" : fmt::format("deviations fall to {:.3g}", p.best);
+  const std::string best =
+      std::isnan(p.best) ? "none within the limits yet" : fmt::format("standard deviations fall to {:.3g}", p.best);
   print_progress(fmt::format("motion {}/{}  {}  about {:.0f} s left", p.n_motions, p.n_all, best, std::max(left, 0.0)));
 }
 
@@ -133,21 +134,20 @@ void run(ExciteArguments& arguments) {
 
 Command excite_command() {
   const auto a = std::make_shared<ExciteArguments>();
-  return {"excite", "Find the motion, within limits, that measuring will tell most of what is not known",
-          "gp2 excite fit.json --start q1=0,q2=0 --duration 10 --inputs-within u1=-5:5,u2=-5:5,u3=-5:5 -o next.csv",
-          joined({{argument("FIT", a->fit, "file written by gp2 fit"),
-                   {"system", &a->system, "OTHER.toml", system_help},
-                   start_option(a->start),
-                   required({"duration", &a->request.duration, "SECONDS", "of the motion [s]"}),
-                   required({"inputs_within", &a->inputs_within, "NAME=LOWEST:HIGHEST,…",
-                             "limits of every input, which it never leaves"}),
-                   {"within", &a->within, "NAME=LOWEST:HIGHEST,…",
-                    "limits of coordinates, velocities and accelerations, kept at every row as the fit predicts the motion"}},
-                  options(a->request),
-                  {{"json", &a->json, "", "report on stdout as JSON"},
-                   output(a->output, "CSV",
-                          "CSV file to write: t, the planned q, dq and ddq, and the inputs, for gp2 simulate too")}}),
-          [a](const std::set<std::string>&) { run(*a); }};
+  return {
+      "excite", "Plan the most informative motion to measure next, within limits",
+      "gp2 excite fit.json --start q1=0,q2=0 --duration 10 --inputs-within u1=-5:5,u2=-5:5,u3=-5:5 -o next.csv",
+      joined({{argument("FIT", a->fit, "file written by gp2 fit"),
+               {"system", &a->system, "OTHER.toml", system_help},
+               start_option(a->start),
+               required({"duration", &a->request.duration, "SECONDS", "duration of the motion [s]"}),
+               required({"inputs_within", &a->inputs_within, "NAME=LOWEST:HIGHEST,…", "limits of every input, never exceeded"}),
+               {"within", &a->within, "NAME=LOWEST:HIGHEST,…",
+                "limits of coordinates, velocities and accelerations, kept at every row of the predicted motion"}},
+              options(a->request),
+              {{"json", &a->json, "", "print the report as JSON"},
+               output(a->output, "CSV", "CSV file to write: t, planned q, dq and ddq, and inputs; gp2 simulate reads it too")}}),
+      [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

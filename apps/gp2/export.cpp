@@ -46,15 +46,12 @@ void run(ExportArguments& arguments) {
 
 Command export_command() {
   const auto a = std::make_shared<ExportArguments>();
-  return {
-      "export",
-      "Write a fit as C: predictions that obey the constraints on machines without gp2, in CasADi and in acados; or the "
-      "parameters of a robot into its own file",
-      "gp2 export fit.json --to c -o controller",
-      joined({{argument("FIT.json", a->fit, "file written by gp2 fit"), {"system", &a->system, "OTHER.toml", system_help}},
-              options(a->request),
-              {output(a->output, "OUT", "folder for the files, which is made where there is none; of mjcf and urdf the file")}}),
-      [a](const std::set<std::string>&) { run(*a); }};
+  return {"export", "Export a fit as C code, also for CasADi and acados, or the parameters of a robot into its MJCF or URDF file",
+          "gp2 export fit.json --to c -o controller",
+          joined({{argument("FIT.json", a->fit, "file written by gp2 fit"), {"system", &a->system, "OTHER.toml", system_help}},
+                  options(a->request),
+                  {output(a->output, "OUT", "folder to write, created if necessary; for mjcf and urdf the file")}}),
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

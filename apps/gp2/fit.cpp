@@ -256,7 +256,7 @@ void require_what_is_asked(const FitProblemOptions& options, const std::set<std:
 void require_inputs(const FitArguments& arguments, const std::set<std::string>& given) {
   if (arguments.again.empty()) {
     if (arguments.model.empty()) throw UsageError{"MODEL is required"};
-    if (!arguments.raw.empty() && !arguments.data.empty()) throw UsageError{"--raw stands for --data: leave out one of them"};
+    if (!arguments.raw.empty() && !arguments.data.empty()) throw UsageError{"--raw replaces --data: leave out one of them"};
     if (!arguments.raw.empty() && !arguments.commands.empty()) throw UsageError{"--raw is the whole log: leave out --commands"};
     if (arguments.data.empty() && arguments.also.empty() && arguments.raw.empty())
       throw UsageError{"--data or --raw is required, or --also alone"};
@@ -265,7 +265,7 @@ void require_inputs(const FitArguments& arguments, const std::set<std::string>& 
   const std::set<std::string> allowed = {"again", "data", "commands", "also", "threads", "checkpoint", "json", "quiet", "output"};
   for (const std::string& name : given) {
     if (!allowed.contains(name)) {
-      throw InputError(fmt::format("`again`: {} has its model and options: leave out {}", arguments.again,
+      throw InputError(fmt::format("`again`: {} contains its model and options: leave out {}", arguments.again,
                                    name == "model" ? "MODEL" : "`" + name + "`"));
     }
   }
@@ -319,9 +319,9 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
       {fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), outcome.posterior.n_states())});
   print();
   if (file.report.termination == FitReport::interrupted) {
-    print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there", interruption.text(),
+    print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} continues from there", interruption.text(),
                              arguments.output, arguments.output)});
-    if (file.report.iterations == 0) print_notes({"the best so far are starting values: no run has got lower yet"});
+    if (file.report.iterations == 0) print_notes({"the best so far are the starting values: no run has improved on them yet"});
     throw Interrupted{interruption.signal()};
   }
 }
@@ -335,24 +335,26 @@ Command fit_command() {
   std::vector<Option> inputs = {
       std::move(model),
       {"data", Repeated{&a->data}, "LOG[@OTHER.toml]",
-       "CSV log; columns are found by name, in any order. Several: --data A.csv --data B.csv@OTHER.toml, where B was measured on "
-       "the system of another model file"},
+       "CSV log, with columns in any order; may be repeated. LOG@OTHER.toml: measured on the system of another model file"},
       {"also", Repeated{&a->also}, "VIEW[@LATENT]:CSV[@OTHER.toml]",
-       "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are observed. "
-       "May be given several times, and without --data"},
+       "another measured or known quantity, such as unconstrained:rest.csv with abar_q1 …; all columns present are observed. May "
+       "be repeated, and used without --data"},
       {"commands", &a->commands, "CSV",
-       "the whole log of t and inputs, and of episode where there are, that --data are rows of: where inputs act late"},
+       "complete log of t and inputs (and episode, if any) from which the rows of --data are taken; for inputs with a delay or "
+       "lag"},
       {"raw", &a->raw, "LOG",
-       "instead of --data: CSV log of t and positions, which learning and smoothing by turns makes data of (docs/raw-logs.md)"},
-      {"smoothed", &a->smoothed, "CSV", "file to write q, dq and ddq of the raw log to, with deviations", "", "", "", "raw"},
+       "instead of --data: CSV log of t and positions, smoothed and learned from in turn (docs/raw-logs.md)"},
+      {"smoothed", &a->smoothed, "CSV", "CSV file to write: q, dq and ddq of the raw log with standard deviations", "", "", "",
+       "raw"},
   };
   return {"fit", "Fit a model to a log of states and accelerations",
           "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json",
           joined({in_group("Data", std::move(inputs)),
                   options(a->request, a->raw_options),
                   {{"again", &a->again, "FIT.json",
-                    "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
-                   {"json", &a->json, "", "report as JSON on stdout"},
+                    "repeat an earlier fit: its model, its options and, unless --data is given, its data; the result is the same "
+                    "to the bit"},
+                   {"json", &a->json, "", "print the report as JSON"},
                    output(a->output, "FIT.json", "fitted model to write (JSON)")}}),
           [a](const std::set<std::string>& given) { run(*a, given); }};
 }

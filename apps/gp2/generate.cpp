@@ -32,7 +32,7 @@ void run(const GenerateArguments& arguments) {
 Command generate_command() {
   const auto a = std::make_shared<GenerateArguments>();
   return {
-      "generate", "Draw states from a model's [sampling] and measure its [truth]",
+      "generate", "Generate data: states from a model's [sampling], accelerations from its [truth] plus noise",
       "gp2 generate models/surface.toml --n 100 --seed 1 -o train.csv",
       joined({{argument("MODEL", a->model, "model file")}, options(a->request), {output(a->output, "CSV", "CSV file to write")}}),
       [a](const std::set<std::string>&) { run(*a); }};

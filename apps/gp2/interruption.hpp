@@ -31,7 +31,7 @@ class LastWord {
   /// @param checkpoint  file that is saved while the fit runs; empty: none
   explicit LastWord(const std::string& checkpoint)
       : checkpoint_(checkpoint),
-        text_(fmt::format("\ngp2: {0} holds the best so far; --start {0} goes on from there\n", checkpoint)),
+        text_(fmt::format("\ngp2: {0} holds the best so far; --start {0} continues from there\n", checkpoint)),
         before_(file_version(checkpoint_)) {}
   /// Says it where there is such a file and it was saved since.
   void say() const {
@@ -89,7 +89,7 @@ class Interruption {
   // a handler may call clock_gettime, sigaction and write, and touch atomics without a lock, and little else
   static void ask(int signal) {
     constexpr std::string_view text =
-        "\ngp2: stopping, which takes some seconds with many rows; once more ends at once, with nothing saved\n";
+        "\ngp2: stopping, which takes some seconds with many rows; a second signal ends it at once, with nothing saved\n";
     const int error = errno;
     timespec now = {};
     clock_gettime(CLOCK_MONOTONIC, &now);

@@ -101,7 +101,7 @@ int usage_error(const std::string& text) {
 
 gp2::Option quiet_option() {
   static bool quiet = false;
-  gp2::Option option{"quiet", &quiet, "", "neither progress nor notes on stderr; warnings and errors remain"};
+  gp2::Option option{"quiet", &quiet, "", "print no progress and no notes, only warnings and errors"};
   option.flag = "-q,--quiet";
   return option;
 }

@@ -15,8 +15,8 @@ namespace gp2::command {
 namespace {
 
 constexpr std::string_view exit_codes =
-    "0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit and gp2 excite "
-    "save the best so far). Results go to stdout, talk to stderr.";
+    "0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit and gp2 excite save "
+    "the best result so far). Results go to stdout, messages to stderr.";
 constexpr std::string_view example =
     "gp2 generate models/surface.toml --n 100 -o train.csv\n"
     "gp2 fit models/surface.toml --data train.csv -o fit.json\n"
@@ -26,9 +26,9 @@ constexpr std::string_view example =
 using Row = std::pair<std::string, std::string>;
 const std::vector<Row>& rows_of_gp2() {
   static const std::vector<Row> rows = {
-      {"-h, --help", "this page; of a command: gp2 help COMMAND"},
+      {"-h, --help", "show this page; for a command: gp2 help COMMAND"},
       {"-V, --version", "the version"},
-      {"--verbose", "with --version: also the compiler, the BLAS and what it uses of the processor"},
+      {"--verbose", "with --version: also the compiler, the BLAS and the processor features it uses"},
   };
   return rows;
 }

@@ -31,11 +31,11 @@ void run(const PlotArguments& arguments) {
 
 Command plot_command() {
   const auto a = std::make_shared<PlotArguments>();
-  return {"plot", "Draw what a fit has learned: one force along one variable, with its 95 % band and where the data are",
+  return {"plot", "Plot what a fit has learned: a force along one variable, with its 95 % band and the data",
           "gp2 plot fit.json --what friction -o friction.svg",
           joined({{argument("FIT.json", a->fit, "file written by gp2 fit")},
                   options(a->request),
-                  {output(a->output, "SVG", "SVG file to write; it needs no network")}}),
+                  {output(a->output, "SVG", "self-contained SVG file to write")}}),
           [a](const std::set<std::string>&) { run(*a); }};
 }
 

@@ -36,13 +36,11 @@ void run(const ReportArguments& arguments) {
 
 Command report_command() {
   const auto a = std::make_shared<ReportArguments>();
-  return {"report",
-          "Write a fit as one HTML page: what was fitted, how well, pictures of residuals, calibration and motion, and what "
-          "to do next",
+  return {"report", "Write an HTML report of a fit: model, accuracy, residuals, calibration, simulated motion, advice",
           "gp2 report fit.json --data test.csv -o report.html",
-          joined({{arguments("FIT.json", a->options.fits, "file written by gp2 fit; several stand side by side on the page")},
+          joined({{arguments("FIT.json", a->options.fits, "file written by gp2 fit; several are compared")},
                   options(a->options),
-                  {output(a->output, "HTML", "HTML file to write; it needs no network")}}),
+                  {output(a->output, "HTML", "self-contained HTML file to write")}}),
           [a](const std::set<std::string>&) { run(*a); }};
 }
 

@@ -23,8 +23,8 @@ void run(const ResampleArguments& arguments) {
   const Resample chosen = resample(model, log, arguments.options);
   log.take(chosen.rows).write(arguments.output);
   if (chosen.n_skipped > 0)
-    print_notes({fmt::format("{}: {} rows skipped: no number in some feature", arguments.log, chosen.n_skipped)});
-  print_notes({fmt::format("measured by {}, each in its standard deviations", fmt::join(chosen.features, ", ")),
+    print_notes({fmt::format("{}: {} rows skipped: a feature has no value", arguments.log, chosen.n_skipped)});
+  print_notes({fmt::format("distances are in {}, each divided by its standard deviation", fmt::join(chosen.features, ", ")),
                fmt::format("{}: {} of {} rows; every other row is within {:.3g} of one of them", arguments.output,
                            chosen.rows.size(), log.n_rows(), chosen.radius)});
   const auto n_repeating = (chosen.distance.array() == 0).count() - 1;  // the first has none before it
@@ -39,11 +39,11 @@ Command resample_command() {
   const auto a = std::make_shared<ResampleArguments>();
   Option n = required({"n", &a->options.n, "N", "number of rows"});
   n.flag = "-n,--n";
-  return {"resample", "Choose the rows of a log that cover its states best: farthest points in the model's features",
+  return {"resample", "Choose the rows of a log that best cover its states (farthest-point sampling in the model's features)",
           "gp2 resample log.csv --model models/surface.toml -n 50 -o subset.csv",
           joined({{argument("LOG", a->log, "CSV log"), required({"model", &a->model, "MODEL", "model file"}), std::move(n)},
                   options(a->options),
-                  {output(a->output, "CSV", "CSV file to write: whole rows in the order of choice")}}),
+                  {output(a->output, "CSV", "CSV file to write: complete rows in the order chosen")}}),
           [a](const std::set<std::string>&) { run(*a); }};
 }
 

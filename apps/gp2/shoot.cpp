@@ -45,13 +45,13 @@ void run(const ShootArguments& arguments) {
 
 Command shoot_command() {
   const auto a = std::make_shared<ShootArguments>();
-  return {"shoot", "Estimate the parameters of a fit anew from the motion over stretches of a log (multiple shooting)",
+  return {"shoot", "Re-estimate the parameters of a fit from motions over stretches of a log (multiple shooting)",
           "gp2 shoot fit.json --data smoothed.csv -o shot.json",
           joined({{argument("FIT.json", a->fit, "file written by gp2 fit, with parameters that it estimates"),
                    required({"data", &a->data, "CSV",
-                             "consecutive rows of t, coordinates, velocities and inputs, as gp2 derive writes them"})},
+                             "CSV with consecutive rows of t, coordinates, velocities and inputs, as written by gp2 derive"})},
                   options(a->request),
-                  {output(a->output, "JSON", "the fit with these parameters")}}),
+                  {output(a->output, "JSON", "fit to write, with the new parameters")}}),
           [a](const std::set<std::string>&) { run(*a); }};
 }
 

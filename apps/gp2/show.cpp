@@ -20,7 +20,7 @@ struct ShowArguments {
 
 Command show_command() {
   const auto a = std::make_shared<ShowArguments>();
-  return {"show", "Print the derived A, b, M, F, the parameters and the features of a model, and what a fit has found",
+  return {"show", "Print M, F, the derived A and b, the parameters and the latents of a model, and the results of a fit",
           "gp2 show models/surface.toml",
           joined({{argument("FILE", a->file, "model file, or file written by gp2 fit")}, options(a->request)}),
           [a](const std::set<std::string>&) {

@@ -269,25 +269,26 @@ void run(const SimulateArguments& arguments) {
   });
   print_notes(notes_of(motions, subject.system(), job, arguments));
   if (arguments.json) print_json(report_of(motions, subject.system(), job));
-  if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));
+  if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds the motion up to there", unfinished, arguments.output));
 }
 
 }  // namespace
 
 Command simulate_command() {
   const auto a = std::make_shared<SimulateArguments>();
-  return {"simulate", "Integrate the motion of a fit or of a model, on its constraints",
-          "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv",
-          joined({{argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
-                   {"system", &a->system, "OTHER.toml", system_help},
-                   start_option(a->start),
-                   required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
-                   {"t_start", &a->t_start, "SECONDS", "its start [s]", "t of the CSV of --start, or 0"},
-                   {"dt", &a->time_step, "SECONDS", "time between written rows; the end is always written [s]", "100 rows"},
-                   {"inputs", &a->inputs, "CSV", "CSV with t and every input, linear in between; must cover the motion", "zero"}},
-                  options(a->request),
-                  {{"json", &a->json, "", "report on stdout as JSON"}, output(a->output, "CSV", "CSV file to write")}}),
-          [a](const std::set<std::string>&) { run(*a); }};
+  return {
+      "simulate", "Simulate the motion of a fit or a model, on its constraints",
+      "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv",
+      joined({{argument("FILE", a->file, "file written by gp2 fit, or a model file, to simulate its force and [truth]"),
+               {"system", &a->system, "OTHER.toml", system_help},
+               start_option(a->start),
+               required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
+               {"t_start", &a->t_start, "SECONDS", "start of the motion [s]", "t of the CSV of --start, or 0"},
+               {"dt", &a->time_step, "SECONDS", "time between written rows; the end is always written [s]", "100 rows"},
+               {"inputs", &a->inputs, "CSV", "CSV with t and every input, interpolated linearly; must cover the motion", "zero"}},
+              options(a->request),
+              {{"json", &a->json, "", "print the report as JSON"}, output(a->output, "CSV", "CSV file to write")}}),
+      [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

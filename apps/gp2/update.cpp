@@ -28,7 +28,7 @@ void run(const UpdateArguments& arguments) {
   const UpdateOutcome outcome = update(FitFile::read(arguments.fit), logs, arguments.request);
   outcome.fit.write(arguments.output);
   print_notes(outcome.notes);
-  print_notes({fmt::format("{}: {} rows more, {} in all; hyperparameters as they were", arguments.output, outcome.n_added,
+  print_notes({fmt::format("{}: {} rows added, {} in all; hyperparameters unchanged", arguments.output, outcome.n_added,
                            outcome.n_states)});
 }
 
@@ -36,12 +36,11 @@ void run(const UpdateArguments& arguments) {
 
 Command update_command() {
   const auto a = std::make_shared<UpdateArguments>();
-  return {"update", "Add more data to a fit, its hyperparameters held: what a machine logs while it runs",
-          "gp2 update fit.json --data today.csv -o fit.json",
+  return {"update", "Add new data to a fit, with fixed hyperparameters", "gp2 update fit.json --data today.csv -o fit.json",
           joined({{argument("FIT.json", a->fit, "file written by gp2 fit"),
-                   required({"data", Repeated{&a->data}, "CSV", "log to add; several may be given"})},
+                   required({"data", Repeated{&a->data}, "CSV", "log to add; may be repeated"})},
                   options(a->request),
-                  {output(a->output, "JSON", "the fit with these data; may be FIT.json itself")}}),
+                  {output(a->output, "JSON", "updated fit to write; may be FIT.json itself")}}),
           [a](const std::set<std::string>&) { run(*a); }};
 }
 

@@ -38,7 +38,7 @@ class Table:
     def keys(self) -> list[str]: ...
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[str]: ...
-    def __contains__(self, arg0: str) -> bool: ...
+    def __contains__(self, arg0: object) -> bool: ...
     def __getitem__(self, name: str) -> _Array: ...
     def to_frame(self) -> Any: ...
 
@@ -119,7 +119,7 @@ class System:
     def evaluate(self, states: npt.ArrayLike | _Table, parameters: Mapping[str, float] = {}) -> Mechanics: ...
     def true_acceleration(self, states: npt.ArrayLike | _Table) -> _Array: ...
     def generate(
-        self, n: int, seed: int = 1, noise_std: float | None = None, grid: Mapping[str, int] = {}
+        self, n: int | None = None, seed: int = 1, noise_std: float | None = None, grid: Mapping[str, int] = {}
     ) -> Table: ...
     def states(self, data: _Table, columns: Mapping[str, str] | None = None) -> _Array: ...
     def __eq__(self, other: object) -> bool: ...
@@ -186,6 +186,8 @@ class FitReport:
     def draws(self) -> dict[str, dict[str, Any]] | None: ...
     def correlation(self, a: str, b: str) -> float: ...
     def __getitem__(self, arg0: str) -> float: ...
+    def __contains__(self, arg0: object) -> bool: ...
+    def __iter__(self) -> Iterator[str]: ...
 
 class Prediction:
     @property
@@ -292,6 +294,10 @@ class Motion:
     def std(self) -> _Array | None: ...
     @property
     def distance_from_data(self) -> _Array | None: ...
+    @property
+    def energy(self) -> _Array | None: ...
+    @property
+    def energy_std(self) -> _Array | None: ...
     @property
     def multipliers(self) -> _Array: ...
     @property
@@ -473,7 +479,7 @@ class Posterior:
         # options of export: written by scripts/options
         to: Literal["c", "casadi", "acados", "mjcf", "urdf"] = "c",
         name: str = "",
-        robot: str = "",
+        robot: str | os.PathLike[str] = "",
         view: Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"] = "constrained",
         dt: float | None = None,
         latent: str | None = None,
@@ -487,7 +493,7 @@ class Posterior:
     @overload
     def simulate(
         self,
-        start: Mapping[str, float] | npt.ArrayLike,
+        start: Mapping[str, float] | npt.ArrayLike | _Table,
         times: npt.ArrayLike,
         inputs: _Table | None = None,
         system: System | None = None,
@@ -503,7 +509,7 @@ class Posterior:
     @overload
     def simulate(
         self,
-        start: Mapping[str, float] | npt.ArrayLike,
+        start: Mapping[str, float] | npt.ArrayLike | _Table,
         times: npt.ArrayLike,
         inputs: _Table | None = None,
         system: System | None = None,
@@ -550,7 +556,7 @@ class InverseDynamicsSolver:
     def inputs_and_cov(self, state: npt.ArrayLike | Mapping[str, float], accelerations: npt.ArrayLike | Mapping[str, float]) -> tuple[_Array, _Array]: ...
 
 class Log:
-    def __init__(self, data: _Table, system: System | None = None) -> None: ...
+    def __init__(self, data: _Table | _Arrays, system: System | None = None) -> None: ...
 
 class SideInformation:
     def __init__(self, view: _View, data: _Table, latent: str = "", system: System | None = None) -> None: ...
@@ -617,7 +623,7 @@ def fit(
     inducing: float | Literal["auto", "none"] | None = None,
     train_on: int | None = None,
     threads: int = 0,
-    checkpoint: str = "",
+    checkpoint: str | os.PathLike[str] = "",
     # end of options
     progress: Callable[[Progress], object] | None = None,
 ) -> Posterior: ...
@@ -654,7 +660,7 @@ def fit_raw(
     inducing: float | Literal["auto", "none"] | None = None,
     train_on: int | None = None,
     threads: int = 0,
-    checkpoint: str = "",
+    checkpoint: str | os.PathLike[str] = "",
     passes: int = 4,
     windows: bool = True,
     episode: str = "",
@@ -669,9 +675,11 @@ def fit_again(
     path: _Path,
     data: _Table | Log | _Arrays | list[Any] | None = None,
     *,
+    commands: _Table | None = None,
     also: SideInformation | Sequence[SideInformation] = [],
     system: System | None = None,
     threads: int = 0,
+    checkpoint: _Path | None = None,
     progress: Callable[[Progress], object] | None = None,
 ) -> Posterior: ...
 def load(path: _Path, system: System | None = None) -> Posterior: ...
@@ -735,7 +743,7 @@ def plot(
 ) -> str: ...
 def simulate(
     system: System,
-    start: Mapping[str, float] | npt.ArrayLike,
+    start: Mapping[str, float] | npt.ArrayLike | _Table,
     times: npt.ArrayLike,
     inputs: _Table | None = None,
     *,
@@ -751,7 +759,7 @@ def simulate(
 ) -> Motion: ...
 def excite(
     posterior: Posterior,
-    start: Mapping[str, float] | npt.ArrayLike,
+    start: Mapping[str, float] | npt.ArrayLike | _Table,
     duration: float,
     inputs_within: Mapping[str, tuple[float, float]],
     within: Mapping[str, tuple[float, float]] | None = None,

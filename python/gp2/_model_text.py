@@ -81,7 +81,7 @@ def _entries(table: Mapping[str, Any]) -> list[str]:
 
 
 def _key(key: str) -> str:
-    return key if key.isidentifier() and key.isascii() else json.dumps(key)
+    return key if key.isidentifier() and key.isascii() else _value(key)
 
 
 def _value(value: Any) -> str:

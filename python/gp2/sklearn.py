@@ -41,7 +41,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         None knows no mechanics: an ordinary Gaussian process from the columns of X to each of y, with one kernel for all.
     mean, prior, baseline, estimate, discrepancy
         As in gp2.fit.
-    observe : names of accelerations, the columns of y; default: those of y where it is a frame, else all.
+    observe : names of accelerations, the columns of y; default: those of y where it is a frame or a Series, else all.
     noise_std : standard deviation of y, or 'estimate'; default: the system's, which for None is estimated.
     n_restarts : runs of the optimiser; default: 5, of a baseline 30.
     max_iterations : of each run; 0 keeps the starting values.
@@ -181,10 +181,13 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _outputs(self, system: gp2.System, y) -> list[str]:
         names = system.acceleration_names
+        of_series = [y.name] if getattr(y, "name", None) in names else None
         if self.observe is not None:
             what, outputs = "observe", [self.observe] if isinstance(self.observe, str) else list(self.observe)
+            if of_series and outputs != of_series:
+                raise gp2.InputError(f"y: no column {', '.join(map(str, outputs))}; it is {y.name}")
         else:
-            what, outputs = "y", _column_names("y", y) or names
+            what, outputs = "y", _column_names("y", y) or of_series or names
         if not outputs:
             raise gp2.InputError(f"{what}: expected at least one name, got []")
         _refuse_twice(what, [str(name) for name in outputs])

@@ -77,8 +77,9 @@ py::object in_order(const py::object& data, const std::vector<std::string>& name
 py::object without_mask(const py::object& array) {
   if (!py::hasattr(array, "mask") || !py::hasattr(array, "filled") || !py::hasattr(array, "dtype")) return array;
   const auto kind = array.attr("dtype").attr("kind").cast<std::string>();
-  if (kind != "f" && kind != "i" && kind != "u") return array;
-  return array.attr("astype")("float64").attr("filled")(not_a_number);
+  const bool is_real = kind == "f" || kind == "i" || kind == "u";
+  return is_real ? array.attr("astype")("float64").attr("filled")(not_a_number)
+                 : array.attr("astype")("object").attr("filled")("");
 }
 
 py::object as_dict(const py::object& given) { return py::hasattr(given, "keys") ? py::object(py::dict(given)) : given; }

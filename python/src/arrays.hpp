@@ -29,7 +29,7 @@ class Rows {
   py::array_t<double, py::array::c_style> array_;
 };
 
-/// A masked array as one that is NaN where it is masked; all else as it is.
+/// A masked array as one that is NaN where it is masked, or an empty text where it does not hold real numbers; all else as it is.
 py::object without_mask(const py::object& array);
 
 /// A mapping of any type, a pandas Series too, as a dict; all else as it is.

@@ -90,6 +90,9 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
 /// The model's name -> the log's name. @throws py::type_error
 std::map<std::string, std::string> columns_argument(const py::object& columns);
 
+/// Beside an array of states. @throws InputError
+void require_no_columns(const py::object& columns);
+
 /// Names that an argument lists; None where it is not given.
 using GivenNames = std::optional<std::vector<std::string>>;
 /// No names stand for all. @throws InputError for an empty list, whose caller does not mean all.
@@ -151,6 +154,16 @@ auto run_interruptibly(const Work& work, std::atomic<bool>& stop, std::exception
       raised = std::current_exception();
       stop = true;
     }
+  }
+}
+
+/// Throws what was raised. A Python exception gets what was found until then as an attribute.
+[[noreturn]] inline void raise_with(const std::exception_ptr& raised, const char* attribute, const py::object& best) {
+  try {
+    std::rethrow_exception(raised);
+  } catch (py::error_already_set& error) {
+    error.value().attr(attribute) = best;
+    throw;
   }
 }
 

@@ -271,7 +271,9 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
   if (!kwargs.contains("latents")) return out;
   std::vector<std::string> parameters;
   if (kwargs.contains("parameters") && !kwargs["parameters"].is_none()) {
-    for (const auto& [name, value] : py::dict(kwargs["parameters"])) parameters.push_back(py::str(name));
+    for (const auto& [name, value] : py::dict(kwargs["parameters"])) {
+      if (!py::isinstance<py::str>(value)) parameters.push_back(py::str(name));  // text follows from the others
+    }
   }
   int number = 0;
   for (const py::handle latent : kwargs["latents"]) {

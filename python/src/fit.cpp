@@ -35,10 +35,6 @@ struct PySideInformation {
   std::optional<PySystem> system;
 };
 
-Log log_of(const py::object& data, const std::optional<PySystem>& system, const std::string& what) {
-  return {to_table(data, what), system ? system->model : nullptr};
-}
-
 // a table of states and accelerations, columns by the model's names; NaN is an empty cell, and a state's column of it is left out
 CsvTable table_of(const py::tuple& arrays, const System& system) {
   if (arrays.size() != 2) throw InputError(fmt::format("data: expected (states, accelerations), got {} arrays", arrays.size()));
@@ -61,23 +57,19 @@ CsvTable table_of(const py::tuple& arrays, const System& system) {
   return CsvTable::from_columns("data", std::move(columns));
 }
 
-std::vector<Log> logs_of(const py::object& data, const System& system) {
-  if (py::isinstance<py::tuple>(data)) return {{table_of(data, system), nullptr, false}};
-  if (!py::isinstance<py::list>(data)) {
-    if (py::isinstance<PyLog>(data)) return logs_of(py::list(py::make_tuple(data)), system);
-    return {log_of(data, std::nullopt, "data")};
-  }
+// A gp2.Log, a table, or a tuple of arrays.
+Log log_of(const py::object& given, const System& fitted, const std::string& what) {
+  const PyLog log = py::isinstance<PyLog>(given) ? given.cast<PyLog>() : PyLog{given, {}};
+  const std::shared_ptr<const Model> other = log.system ? log.system->model : nullptr;
+  if (!py::isinstance<py::tuple>(log.data)) return {to_table(log.data, what), other};
+  return {table_of(log.data, other ? *other->system : fitted), other, false};
+}
+
+std::vector<Log> logs_of(const py::object& data, const System& fitted) {
+  if (!py::isinstance<py::list>(data)) return {log_of(data, fitted, "data")};
   std::vector<Log> logs;
   for (const py::handle entry : data) {
-    const std::string what = fmt::format("data[{}]", logs.size());
-    if (py::isinstance<PyLog>(entry)) {
-      const auto& log = entry.cast<const PyLog&>();
-      logs.push_back(log_of(log.data, log.system, what));
-    } else if (py::isinstance<py::tuple>(entry)) {
-      logs.push_back({table_of(entry.cast<py::tuple>(), system), nullptr, false});
-    } else {
-      logs.push_back(log_of(entry.cast<py::object>(), std::nullopt, what));
-    }
+    logs.push_back(log_of(py::reinterpret_borrow<py::object>(entry), fitted, fmt::format("data[{}]", logs.size())));
   }
   return logs;
 }
@@ -113,7 +105,8 @@ std::vector<SideInformation> side_information_of(const py::object& also) {
           fmt::format("{}: expected a gp2.SideInformation, got {}", what, std::string(py::str(py::type::handle_of(entry)))));
     }
     const auto& one = entry.cast<const PySideInformation&>();
-    out.push_back({quantity_argument(one.view), one.latent, log_of(one.data, one.system, what)});
+    out.push_back(
+        {quantity_argument(one.view), one.latent, {to_table(one.data, what), one.system ? one.system->model : nullptr}});
   }
   return out;
 }
@@ -145,20 +138,17 @@ PyPosterior run(const FitJob& job, const py::object& progress_callback) {
   }
   std::optional<PyPosterior> posterior;
   if (outcome) {
-    if (!raised) tell(outcome->notes);
+    try {
+      if (!raised) tell(outcome->notes);
+    } catch (...) {  // a warning that is an error, which is no reason to lose the fit
+      raised = std::current_exception();
+    }
     std::vector<std::string> notes = job.notes;
     notes.insert(notes.end(), outcome->notes.begin(), outcome->notes.end());
     outcome->file.observations.clear();
     posterior = PyPosterior{std::move(outcome->file), std::move(outcome->posterior), with_keywords(std::move(notes))};
   }
-  if (raised) {
-    try {
-      std::rethrow_exception(raised);
-    } catch (py::error_already_set& error) {
-      error.value().attr("posterior") = posterior ? py::cast(std::move(*posterior)) : py::none();
-      throw;
-    }
-  }
+  if (raised) raise_with(raised, "posterior", posterior ? py::cast(std::move(*posterior)) : py::none());
   return std::move(*posterior);
 }
 
@@ -201,20 +191,27 @@ py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwar
   return py::make_tuple(run(prepared(std::move(request)), progress), std::move(smoothed), std::move(report));
 }
 
-PyPosterior fit_again(const py::object& path, const py::object& data, const py::object& also, const PySystem* system, int threads,
-                      const py::object& progress) {
+PyPosterior fit_again(const py::object& path, const py::object& data, const py::object& commands, const py::object& also,
+                      const PySystem* system, int threads, const py::object& checkpoint, const py::object& progress) {
   require_progress(progress);
   const FitFile file = read_fit(path, system);
+  const auto started = [&](FitJob job) {
+    if (!checkpoint.is_none()) job.checkpoint = path_argument(checkpoint);
+    return run(job, progress);
+  };
   if (data.is_none()) {
     if (!side_information_of(also).empty()) throw InputError("`again`: `also` goes with `data`");
-    return run(unlocked([&] { return prepare_fit_again(file, threads); }), progress);
+    if (!commands.is_none()) throw InputError("`again`: `commands` goes with `data`");
+    return started(unlocked([&] { return prepare_fit_again(file, threads); }));
   }
   FitRequest request = request_of(file);
   request.threads = threads;
   request.data_source.clear();
+  if (!commands.is_none()) request.problem.commands = to_table(commands, "commands");
   request.logs = logs_of(data, *request.model.system);
   request.also = side_information_of(also);
-  return run(prepared(std::move(request)), progress);
+  require_use_of_commands(request);
+  return started(unlocked([&] { return prepare_fit_again(file, std::move(request)); }));
 }
 
 std::string fit_documentation() {
@@ -278,13 +275,21 @@ void add_fit(py::module_& module) {
       .def(py::init([](py::object data, std::optional<PySystem> system) {
              return PyLog{std::move(data), std::move(system)};
            }),
-           "data"_a, "system"_a = py::none());
+           "data"_a, "system"_a = py::none(), "data: as of fit, without lists and other Logs.")
+      .def("__reduce__", [](const py::object& self) {
+        const auto& log = self.cast<const PyLog&>();
+        return py::make_tuple(py::type::of(self), py::make_tuple(log.data, log.system));
+      });
   py::class_<PySideInformation>(module, "SideInformation",
                                 "Another quantity that is measured or known: the columns of a view that a table has.")
       .def(py::init([](std::string view, py::object data, std::string latent, std::optional<PySystem> system) {
              return PySideInformation{std::move(view), std::move(data), std::move(latent), std::move(system)};
            }),
-           "view"_a, "data"_a, "latent"_a = "", "system"_a = py::none());
+           "view"_a, "data"_a, "latent"_a = "", "system"_a = py::none())
+      .def("__reduce__", [](const py::object& self) {
+        const auto& one = self.cast<const PySideInformation&>();
+        return py::make_tuple(py::type::of(self), py::make_tuple(one.view, one.data, one.latent, one.system));
+      });
   py::class_<Progress>(module, "Progress", "What the optimiser tells while it runs.")
       .def_readonly("restart", &Progress::restart, "From 0.")
       .def_readonly("n_restarts", &Progress::n_restarts, "How many runs of the optimiser there are.")
@@ -307,10 +312,11 @@ void add_fit(py::module_& module) {
     module.def("fit_raw", &fit_raw, "system"_a, "data"_a, fit_raw_documentation().c_str());
   }
   module.def(
-      "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "also"_a = py::list(), "system"_a = nullptr,
-      "threads"_a = 0, "progress"_a = py::none(),
+      "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "commands"_a = py::none(), "also"_a = py::list(),
+      "system"_a = nullptr, "threads"_a = 0, "checkpoint"_a = py::none(), "progress"_a = py::none(),
       "Repeat the fit in a FIT.json with the options it was made with, from its data or from those given: the same bits.\n\n"
-      "system: as in gp2.load. A robust fit needs its data.");
+      "system: as in gp2.load; all else as in gp2.fit. A robust fit needs its data. Files that are not those of the fit are "
+      "warned of.");
   module.def(
       "_stub_of_options",
       [](const std::string& job) {

@@ -1,3 +1,5 @@
+#include <algorithm>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <pybind11/stl.h>
@@ -16,8 +18,8 @@ namespace {
 py::list actuators_of(const FitReport& self) {
   py::list out;
   for (const ActuatorEstimate& one : self.actuators) {
-    out.append(py::dict("name"_a = one.name, "value"_a = one.value, "stddev"_a = one.stddev, "lower"_a = one.lower,
-                        "upper"_a = one.upper));
+    out.append(py::dict("name"_a = one.name, "value"_a = one.value, "std"_a = one.stddev, "lower"_a = one.lower,
+                        "upper"_a = one.upper, "at_bound"_a = one.at_lower() || one.at_upper(), "moves"_a = one.moves));
   }
   return out;
 }
@@ -46,12 +48,16 @@ py::dict standard_errors(const FitReport& self) {
   return errors;
 }
 
-std::size_t index_of(const FitReport& self, const std::string& name) {
+std::vector<std::string> names_of(const FitReport& self) {
   std::vector<std::string> names;
-  for (const Hyperparameter& h : self.hyperparameters) {
-    if (h.name == name) return names.size();
-    names.push_back(h.name);
-  }
+  for (const Hyperparameter& h : self.hyperparameters) names.push_back(h.name);
+  return names;
+}
+
+std::size_t index_of(const FitReport& self, const std::string& name) {
+  const std::vector<std::string> names = names_of(self);
+  const auto found = std::ranges::find(names, name);
+  if (found != names.end()) return static_cast<std::size_t>(found - names.begin());
   throw py::key_error(fmt::format("no hyperparameter '{}'; there are: {}", name, fmt::join(names, ", ")));
 }
 
@@ -98,8 +104,9 @@ void define_report(py::class_<FitReport>& report) {
           "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
       .def_property_readonly(
           "actuators", &actuators_of,
-          "Delays and lags of inputs that were estimated, in s: dicts of name, value, stddev (nan at a bound, inf "
-          "where the data do not determine it), lower and upper.")
+          "Delays and lags of inputs that were estimated, in s: dicts of name, value, std (nan at a bound, inf where the data do "
+          "not determine it), lower, upper, at_bound, and moves, by how much its error shifts each estimated parameter, which "
+          "standard_errors count.")
       .def_property_readonly(
           "inducing", &inducing_of,
           "Of a fit through inducing points: n_variables, left_out, of each latent what they leave of its variance at all "
@@ -116,6 +123,12 @@ void define_report(py::class_<FitReport>& report) {
           "std, interval95, r_hat and effective_size; else None.")
       .def("correlation", &correlation, "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
       .def("__getitem__", &value_of)
+      .def("__contains__",
+           [](const FitReport& self, const py::object& name) {
+             return py::isinstance<py::str>(name) && std::ranges::count(names_of(self), name.cast<std::string>()) > 0;
+           })
+      .def(
+          "__iter__", [](const FitReport& self) { return py::iter(py::cast(names_of(self))); }, "Names of the hyperparameters.")
       .def("__repr__", &text_of);
 }
 

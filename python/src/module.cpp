@@ -91,7 +91,7 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
     const bool may_be_none = !optional.empty() || signatures.find(fmt::format("{}: {} = None", name, type)) != std::string::npos;
     const bool is_left_out = value.is_none() && may_be_none;
     if (!is_left_out && !known->fits(value)) throw py::type_error(got(known->words));
-    if (type != "int") continue;
+    if (type != "int" || is_left_out) continue;
     const auto number = py::reinterpret_steal<py::object>(PyNumber_Index(value.ptr()));
     if (!number) throw py::type_error((PyErr_Clear(), got(known->words)));  // an array may only seem to be one
     if (number < py::int_(0)) negative = got("a whole number that is not negative");

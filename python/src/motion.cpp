@@ -22,7 +22,13 @@ struct Motion : SimulatedMotion {
   std::shared_ptr<const System> system;
 };
 
+// A path, or a table, which has named columns where a Series of numbers by name has none.
+bool is_log(const py::object& start) {
+  return py::isinstance<py::str>(start) || py::hasattr(start, "__fspath__") || py::hasattr(start, "columns");
+}
+
 MotionStart start_argument(const py::object& start, const System& system) {
+  if (is_log(start)) return to_table(start, "start");
   if (is_array(start)) {
     const auto values = vector_argument(start, 2 * system.nq(), "start");
     return VectorXd(Eigen::Map<const VectorXd>(values.data(), 2 * system.nq()));
@@ -44,9 +50,12 @@ SimulateRequest simulate_request(const System& system, const py::object& start, 
 /// Motions one after the other; Ctrl-C ends them.
 std::vector<SimulatedMotion> run_motions(const SimulateJob& job) {
   tell(job.notes);
+  std::vector<Trajectory> trajectories = run_or_raise([&](const std::atomic<bool>* stop) { return run_simulation(job, stop); });
   std::vector<SimulatedMotion> motions;
-  for (Trajectory& trajectory : run_or_raise([&](const std::atomic<bool>* stop) { return run_simulation(job, stop); })) {
-    motions.push_back({std::move(trajectory)});
+  for (std::size_t k = 0; k < trajectories.size(); ++k) {
+    SimulatedMotion& motion = motions.emplace_back(SimulatedMotion{std::move(trajectories[k])});
+    const auto& energy = job.motions[k].energy;
+    if (energy) motion.energy = unlocked([&] { return energy(motion.trajectory.states); });
   }
   return motions;
 }
@@ -77,9 +86,10 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
 
 std::string simulate_documentation(const std::string& first, const std::string& last, const std::string& result) {
   SimulateRequest request;
-  return signature("simulate",
-                   first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, " + last + "*,",
-                   options(request), "", result);
+  return signature(
+      "simulate",
+      first + "start: Mapping[str, float] | ArrayLike | Table, times: ArrayLike, inputs: object = None, " + last + "*,",
+      options(request), "", result);
 }
 
 // ---------------------------------------------------------------- the next experiment
@@ -106,13 +116,23 @@ PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, 
   request.within = limits_argument(within, "within");
   const Posterior posterior = self.posterior;
   const FitSystem driven = system_of(self.file, posterior.prior(), model_of(system));
-  PyExcitation out = run_or_raise([&](const std::atomic<bool>* stop) {
-    Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, stop);
+  std::atomic<bool> stop = false;
+  const auto search = [&] {
+    Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, &stop);
     MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
     return PyExcitation{found, {{found.motion, std::move(uncertainty)}, driven.model->system}, driven.model->system};
-  });
-  tell(out.found.notes);
-  return out;
+  };
+  std::exception_ptr raised;
+  std::optional<PyExcitation> out;
+  try {
+    out = run_interruptibly(search, stop, raised, [] {});
+  } catch (const Error&) {
+    if (!raised) throw;  // stopped before there was a motion
+  }
+  if (raised) raise_with(raised, "excitation", out ? py::cast(std::move(*out)) : py::none());
+  tell(out->found.notes);
+  tell(motion_notes({out->motion}));
+  return std::move(*out);
 }
 
 py::dict known_dict(const std::vector<Excitation::Known>& known) {
@@ -166,6 +186,20 @@ void add_motion(py::module_& module) {
             return to_vector(m.uncertainty->distance);
           },
           "As of Prediction, along the motion (n); None as std.")
+      .def_property_readonly(
+          "energy",
+          [](const Motion& m) -> py::object {
+            if (!m.energy) return py::none();
+            return to_vector(m.energy->values);
+          },
+          "Kinetic and potential energy along the motion (n) [J]; None where the model has no potential.")
+      .def_property_readonly(
+          "energy_std",
+          [](const Motion& m) -> py::object {
+            if (!m.energy || m.energy->stddev.size() == 0) return py::none();
+            return to_vector(m.energy->stddev);
+          },
+          "Its standard deviations, of a potential that was learned, against the first state (n) [J]; else None.")
       .def_property_readonly(
           "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
       .def_property_readonly(
@@ -234,7 +268,8 @@ void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module) {
                 (simulate_documentation("self: Posterior, ", "system: System | None = None, ", "Motion | list[Motion]") + R"(
 Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
 
-start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
+start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq; or a table or the path of
+        one, whose first row it is
 times   at which states are wanted (n) [s]; the first is the start
 inputs  a table with t and every input, linear in between, that covers the motion; default: zero
 system  another System with the same coordinates, inputs and latents: its motion
@@ -258,7 +293,7 @@ void define_excite(py::module_& module) {
       "system"_a = nullptr,
       (signature(
            "excite",
-           "posterior: Posterior, start: Mapping[str, float] | ArrayLike, duration: float, inputs_within: Mapping[str, "
+           "posterior: Posterior, start: Mapping[str, float] | ArrayLike | Table, duration: float, inputs_within: Mapping[str, "
            "tuple[float, float]], within: Mapping[str, tuple[float, float]] | None = None, system: System | None = None, *,",
            options(request), "", "Excitation") +
        R"(
@@ -272,7 +307,8 @@ system         another System with the same coordinates, inputs and latents, whi
 
 )" + documentation(options(request)) +
        R"(
-Returns an Excitation. Same seed, same motion, for any number of threads; Ctrl-C ends the search.
+Returns an Excitation. Same seed, same motion, for any number of threads. Ctrl-C raises KeyboardInterrupt, whose attribute
+`excitation` is the best so far (None when there is none yet).
 Raises InputError for limits that do not fit, or that no motion keeps; NumericalError when none could be integrated.)")
           .c_str());
 }

@@ -65,6 +65,8 @@ bool is_list_with_default(const Option& option) {
   return std::holds_alternative<std::vector<std::string>*>(option.value) && !option.otherwise.empty();
 }
 
+bool is_file(const Option& option) { return std::holds_alternative<std::string*>(option.value) && option.sample == "FILE"; }
+
 // None stands for "not given" wherever that is possible.
 bool has_none(const Option& option) {
   return is_list_with_default(option) ||
@@ -91,7 +93,11 @@ void read_keyword(py::handle given, const Option& option) {
           [&](int* value) { *value = argument<int>(given, name, "a whole number"); },
           [&](std::uint64_t* value) { *value = argument<std::uint64_t>(given, name, "a whole number that is not negative"); },
           [&](double* value) { *value = argument<double>(given, name, "a number"); },
-          [&](std::string* value) { *value = argument<std::string>(given, name, "a str"); },
+          [&](std::string* value) {
+            const bool is_path = is_file(option) && py::hasattr(given, "__fspath__");
+            *value =
+                is_path ? path_argument(py::reinterpret_borrow<py::object>(given)) : argument<std::string>(given, name, "a str");
+          },
           [&](std::optional<int>* value) { *value = argument<int>(given, name, "a whole number"); },
           [&](std::optional<std::uint64_t>* value) {
             *value = argument<std::uint64_t>(given, name, "a whole number that is not negative");
@@ -174,7 +180,8 @@ std::string default_of(const OptionValue& value) {
 }
 
 std::string declaration(const Option& option) {
-  return fmt::format("{}: {}{} = {}", keyword_of(option), type_of(option.value), has_none(option) ? " | None" : "",
+  const char* const also = is_file(option) ? " | os.PathLike[str]" : has_none(option) ? " | None" : "";
+  return fmt::format("{}: {}{} = {}", keyword_of(option), type_of(option.value), also,
                      is_list_with_default(option) ? "None" : default_of(option.value));
 }
 

@@ -185,6 +185,7 @@ Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, cons
   WantedMotion wanted;
   if (is_array(data)) {
     if (accelerations.is_none()) throw InputError("accelerations: needed beside an array of states");
+    require_no_columns(columns);
     wanted.view = {View::Quantity::constrained_acceleration, acceleration_rows(there, outputs, "`outputs`")};
     const Rows states(data, there.state_names(), "states"), values(accelerations, wanted.view.names(there), "accelerations");
     wanted.states = states.matrix();
@@ -246,7 +247,7 @@ py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   FitFile file = self.file;
   file.take_data(self.posterior);
-  ShootOutcome shot = unlocked([&] { return shoot(file, table, request); });
+  ShootOutcome shot = run_or_raise([&](const std::atomic<bool>* stop) { return shoot(file, table, request, stop); });
   Posterior posterior = unlocked([&] { return shot.fit.posterior(); });
   tell(shot.notes);
   py::dict parameters, rms;
@@ -266,10 +267,41 @@ py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::
 
 // ---------------------------------------------------------------- data that grow
 
-// Changes are in place and under the interpreter's lock: other Python threads see them before or after. But Python
-// functions of a model let go of the lock while they are called, so that a copy must be changed.
-std::optional<Posterior> kept_by_others(const PyPosterior& self) {
-  return self.file.model.code ? std::optional(self.posterior) : std::nullopt;
+// Changes are in place and under the interpreter's lock: other Python threads see them before or after. But Python functions of a
+// model take that lock, in several threads: there a copy is changed without it.
+template <typename Work>
+void change(PyPosterior& self, const Work& work) {
+  if (!self.file.model.code) return work(self);
+  PyPosterior copy = self;
+  unlocked([&] { work(copy); });
+  self = std::move(copy);
+}
+
+// Adds observations, between what `forget` and `window` ask for.
+void add_observations(PyPosterior& self, Observations more, const CsvTable& log, const UpdateRequest& request,
+                      std::vector<std::string>& notes) {
+  FitFile& file = self.file;
+  if (!request.forget && !request.window) {
+    self.posterior = with_more(std::move(self.posterior), file, std::move(more), log, notes);
+    return;
+  }
+  // a step that is refused undoes those before it
+  const auto undo = [&file, draws = file.report.draws, logs = file.logs, source = file.data_source, said = file.notes] {
+    file.report.draws = draws;
+    file.notes = said;
+    file.logs = logs;
+    file.data_source = source;
+  };
+  Posterior next = self.posterior;
+  try {
+    if (request.forget) next = forget(std::move(next), *request.forget);
+    next = with_more(std::move(next), file, std::move(more), log, notes);
+    keep_newest(next, file, request);
+  } catch (...) {
+    undo();
+    throw;
+  }
+  self.posterior = std::move(next);
 }
 
 void update_with(PyPosterior& self, const py::object& data, const GivenNames& observe, const std::optional<double>& noise_stddev,
@@ -277,32 +309,10 @@ void update_with(PyPosterior& self, const py::object& data, const GivenNames& ob
   const UpdateRequest request{names_or_all(observe, "observe"), noise_stddev, columns_argument(columns), share, window};
   std::vector<std::string> notes;
   const CsvTable log = to_table(data, "data");
-  Observations more = more_observations(self.file, self.posterior, log, request, notes);
+  const auto read = [&](const PyPosterior& at) { return more_observations(at.file, at.posterior, log, request, notes); };
+  Observations more = self.file.model.code ? unlocked([&, held = self] { return read(held); }) : read(self);
   tell(std::exchange(notes, {}));
-  const std::optional<Posterior> kept = kept_by_others(self);
-  if (!share && !window) {
-    self.posterior = with_more(std::move(self.posterior), self.file, std::move(more), log, notes);
-    tell(notes);
-    return;
-  }
-  // a step that is refused undoes those before it
-  const auto undo = [&self, draws = self.file.report.draws, logs = self.file.logs, source = self.file.data_source,
-                     said = self.file.notes] {
-    self.file.report.draws = draws;
-    self.file.notes = said;
-    self.file.logs = logs;
-    self.file.data_source = source;
-  };
-  Posterior next = self.posterior;
-  try {
-    if (share) next = forget(std::move(next), *share);
-    next = with_more(std::move(next), self.file, std::move(more), log, notes);
-    keep_newest(next, self.file, request);
-  } catch (...) {
-    undo();
-    throw;
-  }
-  self.posterior = std::move(next);
+  change(self, [&](PyPosterior& changed) { add_observations(changed, std::move(more), log, request, notes); });
   tell(notes);
 }
 
@@ -457,7 +467,10 @@ view       'constrained': ddq (d = nq); 'unconstrained': the acceleration withou
            'multipliers': λ (d = nc); 'next-velocity': dq + dt ddq; 'force': the applied force that was learned, in N or N m
 system     another System with the same coordinates, inputs and latents: under its constraints, masses and parameters
 latent     only what this latent adds, by its name
+dt         time step of 'next-velocity' [s]
 mean_only  leaves out std and cov, which cost more by two orders
+columns    columns of a table by other names: {"q1": "theta"}
+threads    at most so many; 0: all cores. The result does not depend on it
 
 Returns a Prediction with mean (n, d), std (n, d), cov (n, d, d). Of a table, the logger 'gp2' tells where deviations are too small, as
 gp2 predict does; arrays of states, which a loop may hand over one by one, are predicted and no more.
@@ -563,9 +576,10 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
       .def(
           "remove_oldest",
           [](PyPosterior& self, int n) {
-            const std::optional<Posterior> kept = kept_by_others(self);
-            self.posterior = remove_oldest(std::move(self.posterior), n);
-            if (n > 0) self.file.report.distrusted.clear();  // it counts states from those that are gone
+            change(self, [n](PyPosterior& changed) {
+              changed.posterior = remove_oldest(std::move(changed.posterior), n);
+              if (n > 0) changed.file.report.distrusted.clear();  // it counts states from those that are gone
+            });
           },
           "n"_a = 1, "Remove the n observed states that were added first, in place.")
       .def(

@@ -77,7 +77,7 @@ std::string plot_fit(const py::object& fit, const py::object& path, const py::kw
     svg = picture(posterior, self.file.model);
   } else {
     const FitFile file = read_fit(fit);
-    svg = picture(file.posterior(), file.model);
+    svg = picture(unlocked([&] { return file.posterior(); }), file.model);
   }
   if (!path.is_none()) write_file(path_argument(path), svg);
   return svg;

@@ -102,15 +102,17 @@ Mechanics evaluate(const PySystem& self, const py::object& states, const py::obj
   const System& system = self.system();
   const Rows rows = states_of(self, states);
   const auto given = argument<std::map<std::string, double>>(as_dict(parameters), "parameters", "a dict of names to numbers");
-  SystemValues values = system.evaluate(rows.matrix(), parameter_values(system, given));
+  const Eigen::VectorXd at = parameter_values(system, given);
+  SystemValues values = unlocked([&] { return system.evaluate(rows.matrix(), at); });
   return {to_matrices(values.mass, system.nq(), system.nq()), to_matrices(values.constraint_matrix, system.nc(), system.nq()),
           to_rows(std::move(values.constraint_vector)), to_rows(std::move(values.force))};
 }
 
-CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::optional<double> noise_stddev,
+CsvTable generate_table(const PySystem& self, std::optional<int> n, std::uint64_t seed, std::optional<double> noise_stddev,
                         const py::object& grid) {
   const GenerateRequest request{
       n, argument<std::map<std::string, int>>(as_dict(grid), "grid", "a dict of names to whole numbers"), seed, noise_stddev};
+  if (n.has_value() != request.grid.empty()) throw InputError("give either n, a number of rows, or grid");
   const GeneratedData data = unlocked([&] { return generate(*self.model, request); });
   return as_table(data, self.system(), fmt::format("data of '{}'", self.system().name()));
 }
@@ -134,7 +136,9 @@ CsvTable resample_table(const PySystem& self, const py::object& data, int n, con
   read_keywords("resample", keywords, options(asked));
   asked.n = n;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  return unlocked([&] { return table.take(resample(*self.model, table, asked).rows); });
+  const Resample chosen = run_or_raise([&](const std::atomic<bool>* stop) { return resample(*self.model, table, asked, stop); });
+  if (chosen.n_skipped > 0) tell({fmt::format("{}: {} rows skipped: a feature has no value", table.name(), chosen.n_skipped)});
+  return table.take(chosen.rows);
 }
 
 py::tuple derive_table(const PySystem& self, const py::object& data, const py::object& like, const py::kwargs& keywords) {
@@ -142,7 +146,10 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const py::o
   read_keywords("derive", keywords, options(asked));
   if (!like.is_none()) asked.like = to_table(like, "like", CsvTable::Keep::text);
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  const DerivedData derived = unlocked([&] { return derive(*self.model, table, asked); });
+  const DerivedData derived = run_or_raise([&](const std::atomic<bool>* stop) {
+    asked.stop = stop;
+    return derive(*self.model, table, asked);
+  });
   return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
 }
 
@@ -168,6 +175,11 @@ const char* word(Finding::Level level) {
 std::map<std::string, std::string> columns_argument(const py::object& columns) {
   if (columns.is_none()) return {};
   return argument<std::map<std::string, std::string>>(as_dict(columns), "columns", "a dict of the model's names to the log's");
+}
+
+void require_no_columns(const py::object& columns) {
+  if (columns_argument(columns).empty()) return;
+  throw InputError("columns: renames columns of a table, but states are an array, whose columns have no names");
 }
 
 View::Quantity quantity_argument(const std::string& given) {
@@ -200,6 +212,7 @@ States::States(const py::object& data, const PredictedView& at, const Eigen::Vec
     read_ = std::move(log.states);
     return;
   }
+  require_no_columns(columns);
   const std::vector<std::string> names = system.state_names();
   array_.emplace(data, names, "states");
   const auto states = matrix();
@@ -295,12 +308,13 @@ void define_evaluate_and_generate(py::class_<PySystem>& system) {
       .def(
           "true_acceleration",
           [](const PySystem& self, const py::object& states) {
-            return to_rows(true_acceleration(*self.model, states_of(self, states).matrix()));
+            const Rows rows = states_of(self, states);
+            return to_rows(unlocked([&] { return true_acceleration(*self.model, rows.matrix()); }));
           },
           py::arg("states"),
           "ddq of the model as it is written, with its [truth] (n, nq), at states as of evaluate.\n\n"
           "Raises InputError when there is no [truth].")
-      .def("generate", &generate_table, py::arg("n"), py::arg("seed") = 1, py::arg("noise_std") = py::none(),
+      .def("generate", &generate_table, py::arg("n") = py::none(), py::arg("seed") = 1, py::arg("noise_std") = py::none(),
            py::arg("grid") = py::dict(),
            "Draw states from the model's [sampling] and measure ddq: a Table.\n\n"
            "noise_std: of ddq; default: the model's own. grid: points per range instead of n draws.")

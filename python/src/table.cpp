@@ -98,11 +98,19 @@ void add_table(py::module_& module) {
       .def("__len__", &CsvTable::n_rows, "Number of rows.")
       .def(
           "__iter__", [](const CsvTable& table) { return py::iter(py::cast(table.header())); }, "Names of the columns.")
-      .def("__contains__", [](const CsvTable& table, const std::string& name) { return table.find(name) >= 0; })
+      .def("__contains__",
+           [](const CsvTable& table, const py::object& name) {
+             return py::isinstance<py::str>(name) && table.find(name.cast<std::string>()) >= 0;
+           })
       .def("__getitem__", &column_of, py::arg("name"),
            "A column (n,), NaN where the cell is empty.\n\nRaises KeyError when there is none, InputError when a cell is "
            "something "
            "else than a finite number.")
+      // names and cells of a file need not be UTF-8
+      .def(py::pickle([](const CsvTable& table) { return py::make_tuple(py::bytes(table.name()), py::bytes(table.text())); },
+                      [](const py::tuple& state) {
+                        return CsvTable::parse(std::string(state[1].cast<py::bytes>()), std::string(state[0].cast<py::bytes>()));
+                      }))
       .def("__repr__", [](const CsvTable& table) {
         return fmt::format("<gp2.Table '{}': {} rows of {}>", table.name(), table.n_rows(), fmt::join(table.header(), ", "));
       });

@@ -154,9 +154,8 @@ void Writer::write_expressions() {
   write_system();
   for (Term& term : terms_) {
     write_state_function(term, "features", *term.features, has("jacobian") && term.reads_features());
-    if (term.is_admissible()) {
-      text("admissible") = table("admissible", term.admissible.data(), term.p);
-    } else if (term.has_directions()) {
+    if (term.is_admissible()) text("admissible") = table("admissible", term.admissible.data(), term.p);
+    if (term.has_directions()) {
       write_state_function(term, "directions", *term.directions, has("jacobian") || term.reads_multipliers);
     }
   }

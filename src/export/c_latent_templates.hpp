@@ -22,8 +22,13 @@ inline constexpr std::string_view signal_template = R"c(
 {end}
 {is_positive}  for (int l = 0; l < @p@; ++l) w->signal_@a@[l] = exp(w->signal_@a@[l]);
 {if !reads_multipliers}
-{is_admissible}  for (int i = 0; i < NQ * NQ; ++i) w->B_@a@[i] = w->P[i] * @admissible@[i / NQ];
-{has_directions,!is_admissible}  @directions@(c->parameters, @state_of_directions@, w->B_@a@);
+{has_directions}  @directions@(c->parameters, @state_of_directions@, w->B_@a@);
+{if is_admissible}
+  for (int l = 0; l < NQ; ++l) {
+    const real stddev = w->B_@a@[l + NQ * l];
+    for (int i = 0; i < NQ; ++i) w->B_@a@[i + NQ * l] = w->P[i + NQ * l] * stddev;
+  }
+{end}
 {has_directions}  for (int l = 0; l < @p@; ++l) {
 {has_directions}    for (int i = 0; i < NQ; ++i) w->@to@[i] += w->B_@a@[i + NQ * l] * w->signal_@a@[l];
 {has_directions}  }
@@ -141,8 +146,13 @@ inline constexpr std::string_view dsignal_template = R"c({if features_vary}
   for (int e = 0; e < @n_d_directions@; ++e) {
     const int i = @of_directions@[e][0], l = @of_directions@[e][1], k = @of_directions@[e][2];
 {reads_multipliers}    if (k >= NX) continue; /* in lambda, which follows the state */
-{directions_read_load}    add_change(w->@d_to@, i, k, w->derivative[e] * w->signal_@a@[l], w);
-{!directions_read_load}    w->@d_to@[i + NQ * k] += w->derivative[e] * w->signal_@a@[l];
+{is_admissible}    for (int j = 0; j < NQ; ++j) {
+{is_admissible}      const real change = w->P[j + NQ * i] * w->derivative[e] * w->signal_@a@[l];
+{is_admissible,directions_read_load}      add_change(w->@d_to@, j, k, change, w);
+{is_admissible,!directions_read_load}      w->@d_to@[j + NQ * k] += change;
+{is_admissible}    }
+{!is_admissible,directions_read_load}    add_change(w->@d_to@, i, k, w->derivative[e] * w->signal_@a@[l], w);
+{!is_admissible,!directions_read_load}    w->@d_to@[i + NQ * k] += w->derivative[e] * w->signal_@a@[l];
   }
 {end}
 )c";

@@ -37,9 +37,7 @@ struct Term {
   [[nodiscard]] bool features_read_load() const { return features->tapes().n_loads > 0; }
   [[nodiscard]] bool directions_read_load() const { return has_directions() && directions->tapes().n_loads > 0; }  // λ₀
   [[nodiscard]] bool features_vary() const { return reads_features() && !features->tapes().entries->empty(); }
-  [[nodiscard]] bool directions_vary() const {
-    return has_directions() && !is_admissible() && !directions->tapes().entries->empty();
-  }
+  [[nodiscard]] bool directions_vary() const { return has_directions() && !directions->tapes().entries->empty(); }
   [[nodiscard]] bool is_forced() const { return of->base == Latent::Base::force; }
   [[nodiscard]] bool reads_features() const;
   [[nodiscard]] bool is_se() const;

@@ -39,9 +39,14 @@ Baseline baseline_from(const ParsedJson& json) {
 }
 
 Json discrepancy_json(const Discrepancy& discrepancy) {
-  return {{"lengthscale", vector_json(discrepancy.lengthscale)},
-          {"stddev", vector_json(discrepancy.stddev)},
-          {"directions", name_of(discrepancy_directions, discrepancy.base)}};
+  Json json = {{"lengthscale", vector_json(discrepancy.lengthscale)},
+               {"stddev", vector_json(discrepancy.stddev)},
+               {"directions", name_of(discrepancy_directions, discrepancy.base)}};
+  if (discrepancy.half_range.size() > 0) {
+    json["centre"] = vector_json(discrepancy.centre);
+    json["half_range"] = vector_json(discrepancy.half_range);
+  }
+  return json;
 }
 
 Discrepancy discrepancy_from(const ParsedJson& json) {
@@ -52,9 +57,14 @@ Discrepancy discrepancy_from(const ParsedJson& json) {
   const auto are_scales = [](const Eigen::VectorXd& values) {
     return (values.array() >= smallest_scale && values.array() <= largest_number).all();
   };
-  if (discrepancy.lengthscale.size() == 0 || !are_scales(discrepancy.lengthscale) || !are_scales(discrepancy.stddev)) {
-    throw InputError(
-        fmt::format("lengthscale and stddev of the discrepancy must be from {} to {}", smallest_scale, largest_number));
+  if (json.contains("half_range")) {  // since format 12
+    discrepancy.centre = vector_from(json.at("centre"));
+    discrepancy.half_range = vector_from(json.at("half_range"));
+  }
+  if (discrepancy.lengthscale.size() == 0 || !are_scales(discrepancy.lengthscale) || !are_scales(discrepancy.stddev) ||
+      !are_scales(discrepancy.half_range)) {
+    throw InputError(fmt::format("lengthscale, stddev and half_range of the discrepancy must be from {} to {}", smallest_scale,
+                                 largest_number));
   }
   return discrepancy;
 }

@@ -162,8 +162,7 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
   if (latent.base != Latent::Base::admissible) return;
   at.of_directions->evaluate(VectorXd::Zero(predictor->prior.system->layout().size()), at.directions);
-  at.admissible.emplace(Map<const MatrixXd>(at.directions.data(), nq, nq).diagonal());
-  at.admissible->compute(MatrixXd::Ones(predictor->prior.system->nc(), nq));
+  at.admissible.emplace().compute(MatrixXd::Ones(predictor->prior.system->nc(), nq), at.directions.reshaped(nq, nq));
   at.admissible->set_functions(at.signal);
 }
 
@@ -220,10 +219,10 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       data.evaluate_signal(term, a, here.point, memory, here.signal);
       if (of.is_positive) here.signal = here.signal.array().exp();
       if (here.under_load != nullptr) continue;
+      if (here.of_directions) here.of_directions->evaluate(state, here.directions);
       if (here.admissible) {
-        here.directions = here.admissible->compute(at.A()).reshaped();
-      } else if (here.of_directions) {
-        here.of_directions->evaluate(state, here.directions);
+        const Map<const MatrixXd> B(here.directions.data(), w.a_bar.size(), w.a_bar.size());
+        here.directions = here.admissible->compute(at.A(), B).reshaped();
       }
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }
@@ -429,14 +428,18 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
         if (quantity != StateEvaluator::Quantity::constraint_matrix) continue;
         here.admissible->add_change(i, j, at.derivative_values()[static_cast<Index>(e)], sum.col(k));
       }
-      continue;
     }
-    // dB C g, at held λ where it is read
+    // dB C g, at held λ where it is read; T dB C g of what the constraint leaves
     const auto add = [&](const StateFunction::Evaluator& directions, const VectorXd& dB) {
       for (std::size_t e = 0; e < directions.entries().size(); ++e) {
         const StateDerivatives::Entry& entry = directions.entries()[e];
         if (entry.state_index >= sum.cols()) break;  // in λ, which follows the state
-        sum(entry.output % nq, entry.state_index) += dB[static_cast<Index>(e)] * here.signal[entry.output / nq];
+        const double change = dB[static_cast<Index>(e)] * here.signal[entry.output / nq];
+        if (here.admissible) {
+          sum.col(entry.state_index) += change * here.admissible->projector().col(entry.output % nq);
+        } else {
+          sum(entry.output % nq, entry.state_index) += change;
+        }
       }
     };
     if (here.under_load != nullptr) add(*here.under_load->directions, here.under_load->dB);

@@ -56,10 +56,9 @@ void check_priors(const System& system, std::vector<Finding>& findings) {
     if (of_logarithm) std::tie(lower, upper, middle) = std::tuple(std::log(lower), std::log(upper), std::log(middle));
     const double beyond = std::max(lower - middle, middle - upper) / stddev;
     if (!(beyond > far)) continue;
-    findings.push_back(
-        {Level::warning, fmt::format("parameter '{}': the middle of its prior, {}, lies {:.2g} of its deviations beyond "
-                                     "the bounds {}: estimated, it would end there",
-                                     parameter.name, parameter.prior->median, beyond, bounds)});
+    findings.push_back({Level::warning, fmt::format("parameter '{}': the centre of its prior, {}, lies {:.2g} standard "
+                                                    "deviations outside the bounds {}: an estimate would end at the bound",
+                                                    parameter.name, parameter.prior->median, beyond, bounds)});
   }
 }
 
@@ -78,7 +77,7 @@ void check_columns_of(const CsvTable& table, const LogReader& reader, const Whol
                       std::vector<Finding>& findings) {
   const std::vector<std::string> accelerations = system.acceleration_names();
   const auto good = [&](std::string text) { findings.push_back({Level::good, std::move(text)}); };
-  good(fmt::format("{}: {} rows, every column found that the model reads", table.name(), table.n_rows()));
+  good(fmt::format("{}: {} rows; all columns that the model reads were found", table.name(), table.n_rows()));
   if (!log.missing.empty()) {
     findings.push_back(
         {Level::warning, fmt::format("not in the log: {}; fit with `observe` for the others", fmt::join(log.missing, ", "))});
@@ -174,10 +173,11 @@ class LoadCheck {
       if (load > least) largest = std::max(largest, (multipliers.G(i) * values_.E(a, i).col(l)).norm() / load);
     }
     if (largest < 1e-6) return;
-    findings.push_back({largest > enough ? Level::warning : Level::good,
-                        fmt::format("{}: where it is 1 it changes lambda0, the load that it reads, by up to {:.2g} of it; lambda "
-                                    "is the load with that",
-                                    name, largest)});
+    findings.push_back(
+        {largest > enough ? Level::warning : Level::good,
+         fmt::format(
+             "{}: a value of 1 changes lambda0, the load that it reads, by up to {:.2g} of it; lambda includes this change", name,
+             largest)});
   }
 
   // the least coefficient that leaves a state without a motion
@@ -192,14 +192,13 @@ class LoadCheck {
     double free = 0, jammed = 1e-3;
     while (jammed < most && !fault(jammed)) free = std::exchange(jammed, 2 * jammed);
     if (jammed >= most) {
-      findings.push_back({Level::good, fmt::format("{}: no coefficient jams the load that it reads", name)});
+      findings.push_back({Level::good, fmt::format("{}: no coefficient makes it jam", name)});
       return;
     }
     for (int step = 0; step < 20; ++step) (fault(0.5 * (free + jammed)) ? jammed : free) = 0.5 * (free + jammed);
     findings.push_back(
-        {Level::good, fmt::format("{}: from a coefficient of {:.3g} on it jams the load that it reads (Painlevé's paradox), at "
-                                  "state {} first",
-                                  name, jammed, rows_[static_cast<std::size_t>(fault(jammed)->state)] + 1)});
+        {Level::good, fmt::format("{}: coefficients of {:.3g} or more make it jam (Painlevé's paradox), first at state {}", name,
+                                  jammed, rows_[static_cast<std::size_t>(fault(jammed)->state)] + 1)});
   }
 
   const Model& model_;
@@ -285,10 +284,9 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   const int n_repeated = n_repeated_rows({{log.states, log.accelerations}});
   if (n_repeated * 20 > log.states.cols()) {
     findings.push_back(
-        {Level::warning,
-         fmt::format("{} of {} rows repeat another one to the last digit: they are no measurements of their own, and "
-                     "deviations come out too small; keep each once",
-                     n_repeated, log.states.cols())});
+        {Level::warning, fmt::format("{} of {} rows repeat another one to the last digit: they are not independent measurements, "
+                                     "and standard deviations will be too small; keep each once",
+                                     n_repeated, log.states.cols())});
   }
 }
 
@@ -307,11 +305,10 @@ void check_turns(const WholeLog& log, const System& system, int j, std::vector<F
   }
   if (forth == 0 || back == 0 || static_cast<double>(forth + back) < often * static_cast<double>(n)) return;
   findings.push_back(
-      {Level::warning,
-       fmt::format("{} moves by more than half a turn from row to row, forth and back, at {} of {} rows{}: is it in rad, and "
-                   "sampled often enough?",
-                   system.coordinates()[static_cast<std::size_t>(j)].name, forth + back, n,
-                   q.hasNaN() ? "" : fmt::format(", over a range of {:.3g}", q.maxCoeff() - q.minCoeff()))});
+      {Level::warning, fmt::format("{} moves by more than half a turn from row to row, back and forth, at {} of {} rows{}: is it "
+                                   "in rad, and sampled often enough?",
+                                   system.coordinates()[static_cast<std::size_t>(j)].name, forth + back, n,
+                                   q.hasNaN() ? "" : fmt::format(", over a range of {:.3g}", q.maxCoeff() - q.minCoeff()))});
 }
 
 // Columns that look clipped, inputs with single values that cannot be, and angles in degrees.
@@ -319,15 +316,15 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
   const StateLayout layout = system.layout();
   const auto add = [&](Level level, const std::string& name, const Eigen::RowVectorXd& values, const char* meaning) {
     if (const std::optional<PileUp> found = pile_up(values)) {
-      findings.push_back({level, fmt::format("{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and else takes many "
-                                             "values: {}",
-                                             name, found->value, 100 * found->share, meaning)});
+      findings.push_back(
+          {level, fmt::format("{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: {}", name,
+                              found->value, 100 * found->share, meaning)});
     }
   };
   for (int k = 0; k < layout.nu; ++k) {
     const std::string& name = system.inputs()[static_cast<std::size_t>(k)];
     const std::vector<Eigen::RowVectorXd> u(1, log.states.row(layout.u(k)));
-    add(Level::good, name, u.front(), "clipped? The log must have what acts");
+    add(Level::good, name, u.front(), "clipped? The log must contain the acting input");
     if (std::optional<std::string> far = far_values_text(name, u)) findings.push_back({Level::warning, *std::move(far)});
   }
   const std::vector<std::string> accelerations = system.acceleration_names();
@@ -341,7 +338,7 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
       check_turns(log, system, j, findings);
       continue;
     }
-    findings.push_back({Level::error, fmt::format("{} jumps by 360 from row to row: it is in degrees, and an angle is in rad",
+    findings.push_back({Level::error, fmt::format("{} jumps by 360 from row to row: it is in degrees, but angles must be in rad",
                                                   coordinate.name)});
   }
 }
@@ -367,7 +364,7 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
 }  // namespace
 
 std::vector<Option> options(CheckOptions& options) {
-  return {columns_option(options.columns, "columns by other names: theta1 for q3 also brings dtheta1, ddtheta1")};
+  return {columns_option(options.columns, "columns by other names; theta1=q3 also maps dtheta1 and ddtheta1")};
 }
 
 std::vector<Finding> check(const Model& model, const CsvTable* log, const CheckOptions& options) {
@@ -381,7 +378,7 @@ std::vector<Finding> check(const Model& model, const CsvTable* log, const CheckO
     check_mechanics(model, generate(model, {100, 1, Eigen::VectorXd::Zero(model.system->nq())}).states, findings);
   } else {
     findings.push_back(
-        {Level::warning, "no `data`, and neither [sampling] nor [motion] in the model: nothing to evaluate it at"});
+        {Level::warning, "no `data`, and neither [sampling] nor [motion] in the model: there are no states to check"});
   }
   return findings;
 }

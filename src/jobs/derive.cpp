@@ -13,6 +13,7 @@
 
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
+#include "base/stop.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -206,6 +207,7 @@ class Deriver {
       SmootherFitOptions own;
       own.smoothness = options_.smoothness;
       own.outlier_threshold = options_.outlier_threshold;
+      own.stop = options_.stop;
       own.least_noise_stddev = task.channel.resolution / std::sqrt(12.0);  // of rounding
       if (options_.like) own.model = models_.at(task.coordinate);
       std::vector<Measurement>& measurements = task.channel.measurements;
@@ -230,6 +232,7 @@ class Deriver {
     }
     data_.series.resize(tasks_.size());
     parallel_for(static_cast<int>(tasks_.size()), thread_count(options_.n_threads), [&](int k, int) {
+      require_not_stopped(options_.stop);
       Task& task = tasks_[static_cast<std::size_t>(k)];
       const VectorXd times = times_to_write(episode_of(task.episode));
       write_motion(task, times);
@@ -282,9 +285,9 @@ class Deriver {
     }
     if (moved.empty()) return false;
     data_.notes.push_back(
-        fmt::format("warning: {}: the clock is coarser than the samples: {:.0f} samples have the time of the one before, and {} "
-                    "moved on between, by about {:.2g} s; log times as exactly as positions, or where samples are evenly spaced "
-                    "give an evenly spaced t",
+        fmt::format("warning: {}: the clock is coarser than the samples: {:.0f} samples have the time of the one before, "
+                    "although {} moved in between, by about {:.2g} s; log times as precisely as positions, or, if samples are "
+                    "evenly spaced, an evenly spaced t",
                     log_.name(), largest.n_pairs, fmt::join(moved, ", "), largest.delay()));
     return true;
   }
@@ -573,8 +576,8 @@ class Deriver {
     data_.independent = *independent;
     for (int j = 0; j < nq; ++j) data_.is_independent.row(j) = std::ranges::find(*independent, j) != independent->end();
     data_.notes.push_back(
-        fmt::format("the derived accelerations obey A ddq = b, or a part of it, far better than noise lets them: only {} of {} "
-                    "are independent",
+        fmt::format("the derived accelerations satisfy A ddq = b, or part of it, far more closely than noise allows: only {} of "
+                    "{} are independent",
                     independent->size(), nq));
   }
 
@@ -810,18 +813,20 @@ std::vector<Option> options(DeriveOptions& options) {
                                                        {"us", TimeUnit::microseconds},
                                                        {"ns", TimeUnit::nanoseconds}});
   return {
-      {"episode", &options.episode_column, "COLUMN", "column that tells episodes apart", "episode, where the log has it"},
-      {"episodes", &options.episodes, "0-12,15", "only these", "all"},
-      {"time_unit", time_units, "", "what t counts; auto: as if the log had 2 to 2000 rows per second"},
-      {"rate", &options.rate, "HZ", "rows per second, evenly within an episode, through gaps too", "where there are samples"},
-      {"every", &options.every, "K", "only each so many rows of an episode"},
+      {"episode", &options.episode_column, "COLUMN", "column that identifies the episode", "episode, if the log has it"},
+      {"episodes", &options.episodes, "0-12,15", "use only these episodes", "all"},
+      {"time_unit", time_units, "", "unit of t; auto: the one that gives 2 to 2000 rows per second"},
+      {"rate", &options.rate, "HZ", "output rows per second, evenly spaced within an episode, also through gaps",
+       "at the samples"},
+      {"every", &options.every, "K", "keep every K-th row of an episode"},
       {"hold_constraints", &options.hold_constraints, "",
-       "condition each row on the constraints, where more is measured than they leave free"},
+       "condition each row on the constraints, if more coordinates are measured than are independent"},
       {"outlier_threshold", &options.outlier_threshold, "S",
-       "a sample is distrusted that is farther than this many standard deviations from what the others say; 0: none is"},
+       "treat a sample as an outlier if it is more than this many standard deviations from its prediction by the others; 0: "
+       "never"},
       {"smoothness", choice(options.smoothness, orders), "",
-       "order of the Matérn kernel of the motion; auto: the likelier of 7/2 and 9/2"},
-      {"keep", &options.keep, "NAME,…", "further columns of the log to pass on"},
+       "order of the Matérn kernel of the motion; auto: 7/2 or 9/2, whichever has the higher likelihood"},
+      {"keep", &options.keep, "NAME,…", "further columns of the log to copy to the output"},
       columns_option(options.columns),
   };
 }
@@ -832,7 +837,7 @@ DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions&
 
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const LearnedAccelerations& learned) {
   if (options.rate != 0 || options.every != 1) {
-    throw InputError("smoothing by what was learned is of the samples: `rate` and `every` do not go with it");
+    throw InputError("smoothing with the learned dynamics needs all samples: leave out `rate` and `every`");
   }
   return Deriver(model, log, options, &learned).run();
 }

@@ -187,7 +187,7 @@ struct Doubted {
     });
     if (!out) return out;
     out->text = fmt::format("it and {} are exchanged", system.inputs()[static_cast<std::size_t>(other)]);
-    out->cause = "Their columns are swapped, or the model has them so";
+    out->cause = "Their columns are swapped, in the log or in the model";
     out->other = other;
     return out;
   }
@@ -409,14 +409,13 @@ int resting_input(const Posterior& posterior, std::size_t log) {
 void note_contradiction(const Posterior& posterior, std::size_t log, double gain, std::vector<std::string>& notes) {
   const int resting = resting_input(posterior, log);
   const std::string cause =
-      resting < 0 ? fmt::format("A unit, a sign or a parameter is another {}, or something acts that the model does not know",
+      resting < 0 ? fmt::format("A unit, a sign or a parameter differs {}, or something acts that is not in the model",
                                 posterior.observations().size() == 2 ? "in one of the two" : "there")
                   : fmt::format("Its input {} is {:.4g} in every row: was it logged?",
                                 posterior.prior().system->inputs()[static_cast<std::size_t>(resting)],
                                 posterior.observations()[log].states()(posterior.prior().system->layout().u(resting), 0));
-  notes.push_back(fmt::format(
-      "warning: log {} contradicts the others: each is likelier under a function of its own, by {:.2g} in log likelihood. {}",
-      log + 1, gain, cause));
+  notes.push_back(fmt::format("warning: log {} contradicts the others: separate functions raise the log likelihood by {:.2g}. {}",
+                              log + 1, gain, cause));
 }
 
 // A fit takes up what acts in a log whose input was lost, by a function that bends as it must: the others are fitted without it.
@@ -437,9 +436,8 @@ void note_unexplained(const std::vector<std::string>& inputs, double gain, std::
   if (inputs.empty()) return;
   const bool is_one = inputs.size() == 1;
   notes.push_back(fmt::format(
-      "warning: the model does not explain what the input{} {} {}, by {:.2g} in log likelihood, and no delay, factor or "
-      "exchange of inputs would. The force, an inertia or a coordinate is wrong, or something acts that the model does "
-      "not know",
+      "warning: the model does not explain what the input{} {} {}, by {:.2g} in log likelihood, and no delay, factor or exchange "
+      "of inputs would. The force, an inertia or a coordinate is wrong, or something acts that is not in the model",
       is_one ? "" : "s", fmt::join(inputs, ", "), is_one ? "does" : "do", gain));
 }
 
@@ -451,7 +449,7 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
   double unexplained_gain = 0;
   for (;;) {
     const double as_logged = cost(observations);
-    if (std::isinf(as_logged)) throw NumericalError("some of the rows have no posterior mean by themselves");
+    if (std::isinf(as_logged)) throw NumericalError("some of the rows alone have no posterior mean");
     std::vector<Hypothesis> doubts;
     double gain = least_gain;
     std::ptrdiff_t of_input = -1, of_log = -1;
@@ -480,7 +478,7 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
             doubted.held.empty() ? ""
                                  : fmt::format("; or {}, held by a bound or a prior, is wrong", fmt::join(doubted.held, ", "));
         notes.push_back(
-            fmt::format("warning: the data deny the input {}: they are most likely where {}, by {:.2g} in log likelihood. {}",
+            fmt::format("warning: the data contradict the input {}: they are most likely if {}, by {:.2g} in log likelihood. {}",
                         input.name, explanation->text, explanation->gain, explanation->cause + instead));
       } else {
         unexplained.push_back(input.name);

@@ -71,7 +71,7 @@ void require_order(const std::string& option, const std::string& name, const std
 std::vector<Limit> input_limits(const System& system, const Limits& given) {
   const std::vector<std::string>& inputs = system.inputs();
   if (inputs.empty()) {
-    throw InputError(fmt::format("excite: '{}' has no inputs: there is nothing to drive it by", system.name()));
+    throw InputError(fmt::format("excite: '{}' has no inputs to drive it", system.name()));
   }
   for (const auto& [name, range] : given) {
     if (std::find(inputs.begin(), inputs.end(), name) == inputs.end()) {
@@ -90,7 +90,7 @@ std::vector<Limit> input_limits(const System& system, const Limits& given) {
     limits.push_back({name, found->second.first, found->second.second, system.layout().t() + 1 + std::ssize(limits)});
   }
   if (std::all_of(limits.begin(), limits.end(), [](const Limit& one) { return one.half_width() == 0; })) {
-    throw InputError("`inputs_within`: the limits leave no input any room");
+    throw InputError("`inputs_within`: all inputs are fixed by their limits");
   }
   return limits;
 }
@@ -441,14 +441,15 @@ std::vector<Option> options(ExciteRequest& request) {
                                {"parameters", ExcitationTarget::parameters},
                                {"accelerations", ExcitationTarget::accelerations}}),
        "",
-       "parameters: those that the fit estimated (D-optimal); accelerations: where motions within the limits go; auto: "
-       "parameters where there are any",
+       "what the motion should determine; parameters: those that the fit estimated (D-optimal); accelerations: those along "
+       "motions within the limits; auto: parameters if any are estimated",
        "", "target"},
-      {"rows", &request.n_rows, "N", "of the motion, evenly in time: the measurements that it is taken to give", "", "n_rows"},
-      {"harmonics", &request.n_harmonics, "K", "of each input: frequencies 1/duration … K/duration [Hz]", "", "n_harmonics"},
-      {"motions", &request.n_motions, "M", "that are tried", "", "n_motions"},
-      {"seed", &request.seed, "S", "of the search; same seed, same motion"},
-      columns_option(request.columns, "columns of a log that `start` is, by other names"),
+      {"rows", &request.n_rows, "N", "number of measurements along the motion, evenly spaced in time", "", "n_rows"},
+      {"harmonics", &request.n_harmonics, "K", "number of frequencies of each input: 1/duration … K/duration [Hz]", "",
+       "n_harmonics"},
+      {"motions", &request.n_motions, "M", "number of motions to try", "", "n_motions"},
+      {"seed", &request.seed, "S", "random seed of the search"},
+      columns_option(request.columns, "columns by other names, if `start` is a log"),
       threads_option(request.threads),
   };
 }
@@ -465,9 +466,9 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
   const Model& model = *driven.model;
   const System& system = *model.system;
   require_options(request);
-  if (posterior.prior().reference) throw InputError("excite: a baseline knows no constraints, so that it has no motion to plan");
+  if (posterior.prior().reference) throw InputError("excite: a baseline knows no constraints, so it has no motion to plan");
   if (observed_rows(posterior).empty()) {
-    throw InputError("excite: the fit observed no accelerations, so that it does not know with which noise they are measured");
+    throw InputError("excite: the fit observed no accelerations, so their noise is unknown");
   }
   const std::vector<Limit> inputs = input_limits(system, request.inputs_within), limits = state_limits(system, request.within);
 
@@ -487,7 +488,7 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
   require_start_within(motion.start, limits);
   out.notes = motion.notes;
   if (posterior.n_states() > n_states(posterior.observations())) {
-    out.notes.push_back(fmt::format("what is known already is reckoned from {} of the {} rows of the fit",
+    out.notes.push_back(fmt::format("present standard deviations are computed from {} of the {} rows of the fit",
                                     n_states(posterior.observations()), posterior.n_states()));
   }
 

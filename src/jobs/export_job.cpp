@@ -46,7 +46,7 @@ void require_options(const ExportRequest& request, const std::string& name) {
     if (request.view.quantity != whole.quantity || request.view.latent || request.view.time_step || request.view.system ||
         request.single_precision || request.portable_math || request.draws_within || !request.stddev || !request.jacobian) {
       throw InputError(
-          fmt::format("`to={}` writes parameters, no functions: it goes with `robot` and `name` alone", word(request.to)));
+          fmt::format("`to={}` writes parameters, not functions: it goes with `robot` and `name` only", word(request.to)));
     }
     return;
   }
@@ -135,7 +135,7 @@ ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
   const std::vector<FittedNumber> numbers = fitted_numbers(fit, names.parameters);
   if (numbers.empty()) {
     throw InputError(
-        fmt::format("`to={}`: the model has no number of its robot as a parameter that differs; write [parameters] m7 = {{ of = "
+        fmt::format("`to={}`: no parameter of the model changes a number of its robot; write [parameters] m7 = {{ of = "
                     "'mass(\"link7\")', estimate = true }} and fit again",
                     to));
   }
@@ -146,7 +146,7 @@ ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
   const std::string text = read_file(path);
   const bool is_urdf = read_robot_xml(text, path).is_urdf;
   if (is_urdf != (request.to == Target::urdf)) {
-    throw InputError(fmt::format("`to={}`: '{}' is a file of the other format, and is written into by `to={}`", to, path.string(),
+    throw InputError(fmt::format("`to={}`: '{}' is a file of the other format; use `to={}`", to, path.string(),
                                  word(is_urdf ? Target::urdf : Target::mjcf)));
   }
   if (const auto other = first_difference(read_robot(path), *fit.model.robot)) {
@@ -163,7 +163,7 @@ ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
     }
   }
   if (text.find(is_urdf ? " filename=" : " file=") != std::string::npos) {
-    written.notes.push_back(fmt::format("the file names others: it belongs into the folder of {}", path.string()));
+    written.notes.push_back(fmt::format("the file refers to others: put it into the folder of {}", path.string()));
   }
   return {{{name + (is_urdf ? ".urdf" : ".xml"), std::move(written.text)}}, std::move(written.notes), path.string()};
 }
@@ -172,7 +172,7 @@ std::vector<Option> options(ExportRequest& request) {
   std::vector<Option> of_view = options(request.view);
   for (Option& option : of_view) {
     if (option.name == "dt")
-      option = {"dt", option.value, option.sample, "time step of next-velocity, or of the step for acados [s]"};
+      option = {"dt", option.value, option.sample, "time step of next-velocity, or of the acados model [s]"};
   }
   const std::vector<Option> files = {
       {"to",
@@ -182,23 +182,22 @@ std::vector<Option> options(ExportRequest& request) {
                            {"mjcf", Target::mjcf},
                            {"urdf", Target::urdf}}),
        "",
-       "c: NAME.h and NAME.c, C99 that needs <math.h> alone; casadi: also NAME_casadi.c, an external function with its Jacobian; "
-       "acados: NAME_acados.c, a generic discrete step of `dt` with its sensitivities; mjcf, urdf: the robot's own file with "
-       "the numbers that the model has as parameters"},
-      {"name", &request.name, "NAME", "what the files and every name in them begin with", "that of the system"},
-      {"robot", &request.robot, "FILE", "of mjcf and urdf: the robot's file",
-       "the one that the model names, beside the model's"}};
+       "format; c: NAME.h and NAME.c, C99 that needs only <math.h>; casadi: also NAME_casadi.c, an external function with its "
+       "Jacobian; acados: NAME_acados.c, generic discrete dynamics with step `dt` and their sensitivities; mjcf, urdf: the "
+       "robot's file with the parameter values of the fit"},
+      {"name", &request.name, "NAME", "prefix of the files and of all names in them", "the system's name"},
+      {"robot", &request.robot, "FILE", "the robot's file, for mjcf and urdf",
+       "the file that the model names, next to the model file"}};
   const std::vector<Option> functions = {
       {"std", YesByDefault{&request.stddev}, "",
-       "the function of the standard deviation, which stores n²/2 numbers of n reduced observations"},
-      {"jacobian", YesByDefault{&request.jacobian}, "", "the function of the Jacobian"},
-      {"float", &request.single_precision, "", "in single precision; refused where its error would show", "", "single"},
+       "the standard deviation, which needs n²/2 stored numbers for n reduced observations"},
+      {"jacobian", YesByDefault{&request.jacobian}, "", "the Jacobian"},
+      {"float", &request.single_precision, "", "single precision; an error if rounding would matter", "", "single"},
       {"portable_math", &request.portable_math, "",
-       "numbers that are the same to the bit on every machine and compiler: exp, sin and others of its own in place of "
-       "those of <math.h>"},
+       "bit-identical results on every machine and compiler: own exp, sin and others instead of those of <math.h>"},
       {"draws_within", &request.draws_within, "E",
-       "of a fit whose hyperparameters are integrated: few draws, which stand for all within this share of a standard "
-       "deviation of the exported view: root mean square over up to 300 observed states, of which single ones may be off by more",
+       "for integrated hyperparameters: export only as many draws as keep the rms error of the view below this fraction of its "
+       "standard deviation, over up to 300 observed states; single states may be off by more",
        "all draws"}};
   return joined({files, of_view, functions});
 }
@@ -214,7 +213,7 @@ ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const E
   const bool few = request.draws_within && posterior.n_components() > 1;
   const Posterior exported = few ? posterior.components(posterior.fewest_components(*request.draws_within, at.view)) : posterior;
   if (few) {
-    out.notes.push_back(fmt::format("{} of {} draws stand for all", exported.n_components(), posterior.n_components()));
+    out.notes.push_back(fmt::format("{} of {} draws represent all", exported.n_components(), posterior.n_components()));
   }
   const CSourceOptions options{
       name,

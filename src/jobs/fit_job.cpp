@@ -117,7 +117,7 @@ int settled_draws(const FitRequest& request, const FitProblem& problem, const Fi
     throw InputError("`hyperparameters=integrate` is not for a `baseline`, whose hyperparameters are optimised");
   }
   if (options.max_iterations == 0) {
-    throw InputError("`hyperparameters=integrate` draws about the optimum: it cannot be with `max_iterations=0`");
+    throw InputError("`hyperparameters=integrate` samples around the optimum: leave out `max_iterations=0`");
   }
   return options.n_inducing > 0 ? n_mixed_draws_through_points : n_mixed_draws;
 }
@@ -137,7 +137,7 @@ void take_logs(const FitRequest& request, const std::vector<Observations>& obser
     if (!log.table.file()) continue;
     if (file.has_learned(*log.table.file())) {
       is_known = true;
-      notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.table.name()));
+      notes.push_back(fmt::format("warning: {} is already in the fit: its rows count twice", log.table.name()));
     }
     file.logs.push_back(*log.table.file());
   }
@@ -180,10 +180,10 @@ void note_load_without_force(const FitProblem& problem, std::vector<std::string>
     return !group.view().other_system && !prior.system->evaluate(group.states(), parameters).force.isZero(0);
   };
   if (std::ranges::none_of(problem.observations, has_force)) return;
-  notes.push_back(fmt::format(
-      "warning: {} reads constraint forces (lambda), and the known force of [mechanics], which makes them, is not used: fit with "
-      "`mean=force`, unless other latents are to learn that force",
-      latent->name));
+  notes.push_back(
+      fmt::format("warning: {} reads constraint forces (lambda), but the known force of [mechanics], which causes them, is not "
+                  "used: fit with `mean=force`, unless other latents are to learn that force",
+                  latent->name));
 }
 
 // What both kinds of preparation end with.
@@ -357,7 +357,7 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   tests.run("the inputs and the logs",
             [&] { add_doubts(posterior, judged.lines, has_row_order, held_parameters(report), fitted_values, notes); });
   const std::string correlated = scores ? correlated_text(scores->residuals) : "";
-  if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
+  if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: standard deviations are too small", correlated));
   tests.add_notes(notes);
 }
 
@@ -385,8 +385,8 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   if (const int n_all = n_states(job.problem.observations);
       options.n_train > 0 && options.n_train < n_all && options.max_iterations > 0) {
     outcome.notes.push_back(
-        fmt::format("hyperparameters and estimated parameters come from {} of {} rows (`train_on`): deviations "
-                    "may be too small; more rows, or all, tell more",
+        fmt::format("hyperparameters and estimated parameters come from {} of {} rows (`train_on`): standard deviations may be "
+                    "too small; more rows, or all, are better",
                     options.n_train, n_all));
   }
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
@@ -451,7 +451,8 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
   fewer.options.ranks = job.options.ranks;
   fewer.checkpoint = job.checkpoint;
   FitOutcome outcome = run_fit(fewer, progress, stop);
-  outcome.notes.push_back(fmt::format("{}: fitted to {} of {}, evenly taken (`thin=none` fits all)", worth.text, n_taken, n_all));
+  outcome.notes.push_back(
+      fmt::format("{}: fitted to {} of {}, evenly spaced (`thin=none` fits all)", worth.text, n_taken, n_all));
   std::rotate(outcome.notes.begin(), outcome.notes.end() - 1, outcome.notes.end());
   return outcome;
 }
@@ -511,7 +512,7 @@ FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<vo
     if (!job.unaffordable.empty()) throw;
     if (!all) all = run_once(job, progress, stop);
     if (!is_set(stop))
-      all->notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));
+      all->notes.push_back(fmt::format("fitted to all rows, because the fit to fewer rows failed: {}", error.what()));
     return *all;
   }
 }
@@ -529,95 +530,94 @@ std::vector<Option> options(FitRequest& request) {
       in_group(
           "Data",
           {
-              {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of what `also` gives",
+              {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of the values in `also`",
                "for accelerations: the model's [noise]"},
               {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
-              columns_option(problem.columns,
-                             "columns by other names, in all logs together: theta1 for q3 also brings dtheta1, ddtheta1"),
+              columns_option(problem.columns, "columns by other names, in all logs; theta1=q3 also maps dtheta1 and ddtheta1"),
               {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
                "those with a column NAME_std in the log, or all"},
               {"noise_std",
                NumberOrWord{&problem.noise_stddev,
                             {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}},
-               "S", "noise standard deviation of every observed ddq, 'estimate', or 'stated' for the log's NAME_std as they are",
-               "the log's NAME_std times a factor that is estimated, or as the model says"},
+               "S",
+               "noise standard deviation of every observed ddq; estimate: estimate it; stated: use the log's NAME_std unchanged",
+               "the log's NAME_std times an estimated factor, else the model's [noise]"},
               {"max_points", &problem.max_points, "N",
-               "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion "
-               "best, or so many states of windows",
-               "all; of a raw log 200, or 600 of windows"},
+               "maximum number of rows per log, chosen at random by `seed`; of a raw log those that cover the motion best, or "
+               "the number of states with windows",
+               "all; raw log: 200, or 600 with windows"},
               {"thin", Switch{&request.thin, "auto", "none"}, "",
-               "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
+               "what to do if residuals are correlated from row to row; auto: refit to every k-th row, so that they are nearly "
+               "uncorrelated; none: keep all rows"},
               {"project", &problem.project, "",
-               "move states onto position and velocity constraints, with the model's parameters, before anything else"},
-              {"robust", &problem.robust, "",
-               "distrust values that disagree with all others, and say which (docs/command-line.md)"},
+               "first project states onto the position and velocity constraints, with the model's parameter values"},
+              {"robust", &problem.robust, "", "give outliers a larger noise, and list them (docs/command-line.md)"},
           }),
       in_group(
           "What is learned",
           {
               {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
-               "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model, where that is relied on"},
+               "prior mean of the unconstrained acceleration; force: M⁻¹F of the model"},
               {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
-               "put the model's latent on the acceleration or on the force", "as the model says"},
+               "whether the model's latent acts on accelerations or forces", "as in the model"},
               {"baseline",
                choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}),
                "",
-               "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the "
-               "model's features and what else of the state it reads"},
-              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
+               "learn ddq without mechanics (docs/priors.md), from the features and all state entries that the model reads; se: "
+               "independent outputs; icm, lmc: multi-output"},
+              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those marked in the model"},
               {"protocol",
                choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
-               "how hyperparameters start and are bounded (docs/priors.md): default, or paper: the set-up of Geist & Trimpe "
-               "2020"},
+               "initial values and bounds of hyperparameters (docs/priors.md); paper: as in Geist & Trimpe 2020"},
               {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
-               "weak log-normal hyper-priors, or none: maximum likelihood within the same bounds"},
+               "hyper-priors; default: weak, log-normal; none: maximum likelihood within the same bounds"},
               {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
-               "a small latent for what the kernel would rule out (docs/priors.md), or none"},
+               "whether to add a small latent for effects that the kernels cannot represent (docs/priors.md)"},
           }),
       in_group(
           "How it is learned",
           {
-              {"restarts", &request.restarts, "R", "runs of the optimiser; the first starts at the model's values",
-               "5; of a baseline 30"},
+              {"restarts", &request.restarts, "R", "number of optimiser runs; the first starts at the model's values",
+               "5; baseline: 30"},
               {"max_iterations", &request.max_iterations, "K",
-               "per run, what follows an escape included; 0 conditions at the starting values"},
-              {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
+               "maximum iterations per run, including those after an escape; 0: no optimisation, condition at the starting "
+               "values"},
+              {"max_escapes", &request.max_escapes, "K",
+               "maximum number of escapes: scans for a lower optimum that start at the best one", "5"},
               {"gradient_tolerance", &request.gradient_tolerance, "G",
-               "stop when the largest entry of the projected gradient is below", "1e-5"},
+               "stop when the largest entry of the projected gradient is below this", "1e-5"},
               {"reduction_tolerance", &request.reduction_tolerance, "R",
-               "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
-              {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
-              {"seed", &problem.seed, "S", "of restarts and `max_points`"},
+               "stop when the relative reduction of the objective in an iteration is below this", "1e-12; baseline: 1e-9"},
+              {"start", &request.start, "FILE", "starting values: a JSON file {\"name\": value, …} or a FIT.json"},
+              {"seed", &problem.seed, "S", "random seed of restarts and `max_points`"},
               {"hyperparameters",
                choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
                                                 {"integrate", HyperparameterChoice::integrate},
                                                 {"auto", HyperparameterChoice::automatic}}),
                "",
                fmt::format(
-                   "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
-                   "draws (docs/theory.md, T31), through inducing points of {}, at about {} evaluations of the likelihood; auto: "
-                   "integrate where the directions of a latent have their own, as in the default prior, or it is a potential, "
-                   "and rows times free directions of motion are at most {}",
+                   "point estimate or posterior of the hyperparameters; optimise: the most probable values; integrate: sample "
+                   "the posterior and mix the predictions of {} draws (docs/theory.md, T31), {} with inducing points, at about "
+                   "{} evaluations of the likelihood; auto: integrate if a latent has lengthscales per direction, as in the "
+                   "default prior, or is a potential, and rows times degrees of freedom are at most {}",
                    n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
               {"standard_errors", YesByDefault{&request.standard_errors}, "",
-               "the standard errors of estimated parameters, which take a few dozen gradients"},
+               "standard errors of estimated parameters, which cost a few dozen gradients"},
               {"inducing",
                NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
-               fmt::format("learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional "
-                           "to their number: at most so many variables, each one function of a latent at one point; none: "
-                           "exactly; auto: exactly up to {} rows times free directions of motion, through at most {} variables "
-                           "beyond, fewer where there are more than 100 000 rows",
+               fmt::format("maximum number of inducing variables, each one function of a latent at one point (docs/theory.md, "
+                           "T37); the time is proportional to the number of rows. none: exact; auto: exact up to {} rows times "
+                           "degrees of freedom, beyond that at most {} variables, fewer for more than 100 000 rows",
                            largest_exact_size, most_inducing_variables),
                "auto"},
               {"train_on", &request.train_on, "N",
-               "find hyperparameters and estimated parameters from so many rows, evenly taken from all logs together, and learn "
-               "from "
-               "all under these: quick, with deviations that may be too small",
+               "find hyperparameters and parameters from N rows, evenly spaced over all logs together, then condition on all "
+               "rows; fast, but standard deviations may be too small",
                "all rows"},
               threads_option(request.threads),
               not_recorded({"checkpoint", &request.checkpoint, "FILE",
-                            "a FIT.json of the best so far, written anew whenever a run of the optimiser has got lower and every "
-                            "few seconds while one does; `start` goes on from it (docs/command-line.md)",
+                            "FIT.json with the best result so far, rewritten after each run that improves it and every few "
+                            "seconds during such a run; resume with `start` (docs/command-line.md)",
                             "none"}),
           }),
   });
@@ -646,7 +646,7 @@ FitJob prepare_fit(FitRequest request) {
 
 FitRequest request_of(const FitFile& fit) {
   if (fit.options.empty()) {
-    throw InputError("the fit does not say what it was asked: its file is of a gp2 before format 6; fit anew");
+    throw InputError("the file does not contain the options of the fit: it is older than format 6; fit again");
   }
   FitRequest request;
   request.model = fit.model;
@@ -663,16 +663,18 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   request.threads = threads;
   require_in_range(request);
   if (request.problem.robust) {
-    throw InputError("`again`: the data of a robust fit are marked by what it distrusts; give its logs by `data`");
+    throw InputError("`again`: the file of a robust fit has changed noise in its data; give its logs with `data`");
   }
   const std::vector<std::int64_t> n = fit.n_states();
   const std::int64_t n_all = std::accumulate(n.begin(), n.end(), std::int64_t{0});
   if (n_all > n_states(fit.observations)) {
-    throw InputError(fmt::format("`again`: the file holds what {} rows say, and {} of them; give its logs by `data`: {}", n_all,
-                                 n_states(fit.observations), fit.data_source));
+    throw InputError(
+        fmt::format("`again`: the file contains sums over {} rows, and only {} of the rows; give its logs with `data`: {}", n_all,
+                    n_states(fit.observations), fit.data_source));
   }
   if (fit.report.termination == has_some_rows) {
-    throw InputError(fmt::format("`again`: the checkpoint holds some of the rows; give its logs by `data`: {}", fit.data_source));
+    throw InputError(
+        fmt::format("`again`: the checkpoint contains only some of the rows; give its logs with `data`: {}", fit.data_source));
   }
   FitProblem problem;
   problem.prior_options = fit.prior_options;
@@ -695,15 +697,14 @@ FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
   for (const LogFile& log : job.file.logs) {
     if (fit.has_learned(log)) continue;
     const auto named = std::ranges::find(fit.logs, log.name, &LogFile::name);
-    job.notes.push_back(
-        named == fit.logs.end()
-            ? fmt::format("warning: {} is not a log that the fit was learned from", log.name)
-            : fmt::format("warning: {} is not as the fit was learned from it: {} bytes, {} rows; then {} bytes, {} rows",
-                          log.name, log.bytes, log.rows, named->bytes, named->rows));
+    job.notes.push_back(named == fit.logs.end()
+                            ? fmt::format("warning: {} is not a log of the fit", log.name)
+                            : fmt::format("warning: {} has changed since the fit: now {} bytes, {} rows; then {} bytes, {} rows",
+                                          log.name, log.bytes, log.rows, named->bytes, named->rows));
   }
   for (const LogFile& log : fit.logs) {
     if (!job.file.has_learned(log) && std::ranges::find(job.file.logs, log.name, &LogFile::name) == job.file.logs.end()) {
-      job.notes.push_back(fmt::format("warning: the fit was learned from {} too, which is not given", log.name));
+      job.notes.push_back(fmt::format("warning: {}, a log of the fit, is not given", log.name));
     }
   }
   return job;

@@ -39,8 +39,8 @@ void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes
     const auto [least, most] = std::ranges::minmax_element(ones, {}, &Found::stddev);
     if (!(most->stddev > much * least->stddev)) continue;
     notes.push_back(
-        fmt::format("warning: the noise of {} is found {:.2g} times as large in log {} as in log {}: what it says may not be "
-                    "noise, but contradict the others; see gp2 check",
+        fmt::format("warning: the estimated noise of {} is {:.2g} times as large in log {} as in log {}: the log may contradict "
+                    "the others rather than be noisy; see gp2 check",
                     of.first, most->stddev / least->stddev, most->log + 1, least->log + 1));
   }
 }
@@ -54,8 +54,8 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
     for (int k = 0; k < system.layout().nu; ++k) {
       if (const std::optional<PileUp> found = pile_up(group.states().row(system.layout().u(k)))) {
         notes.push_back(
-            fmt::format("the input {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and else takes many "
-                        "values: clipped? The log must have what acts",
+            fmt::format("the input {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: "
+                        "clipped? The log must contain the acting input",
                         system.inputs()[static_cast<std::size_t>(k)], of_log, found->value, 100 * found->share));
       }
     }
@@ -63,8 +63,8 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
     for (int k = 0; k < view.size(); ++k) {
       if (const std::optional<PileUp> found = pile_up(group.values().row(k))) {
         notes.push_back(
-            fmt::format("warning: {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and else takes many "
-                        "values: a sensor at the end of its range?",
+            fmt::format("warning: {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: a "
+                        "sensor at the end of its range?",
                         names[static_cast<std::size_t>(k)], of_log, found->value, 100 * found->share));
       }
     }
@@ -101,7 +101,7 @@ std::string gross_errors_text(const FitProblem& problem) {
     far.resize(most_shown);
     far.emplace_back("…");
   }
-  return fmt::format("single values lie far from all others: {}. Mend or empty these cells, or fit with `robust`",
+  return fmt::format("single values lie far from all others: {}. Correct or empty these cells, or fit with `robust`",
                      fmt::join(far, ", "));
 }
 
@@ -168,8 +168,8 @@ void add_far_value_note(const JudgedData& judged, const std::vector<TrainingResi
                                                                               judged.observations.size() == 1);
   const bool is_open = farthest->rms_in_noise > much * std::max(1.0, farthest->rms);
   notes.push_back(fmt::format(
-      "warning: {} of the values lie six deviations or more from what all others predict, up to {:.2g} ({}{}): {}outliers of "
-      "the log, or rare states of which the others tell nothing while the fit is sure of itself; see `robust`",
+      "warning: {} of the values lie six or more standard deviations from their prediction by all others, up to {:.2g} ({}{}): "
+      "{}outliers of the log, or rare states at which the fit is overconfident; see `robust`",
       n_far, farthest->farthest, farthest->output, where,
       is_open ? "a mass, a length or a force that is wrong, as all values are predicted far worse than the noise; or " : ""));
 }
@@ -216,17 +216,17 @@ void add_residual_notes(const Posterior& posterior, const JudgedData& judged, co
       large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
   }
   if (!large.empty()) {
-    notes.push_back(fmt::format(
-        "warning: values lie farther than noise from what all others predict: {}: the noise is stated too small, a "
-        "column is wrong or lags, a mass, a length or a force is wrong, or the constraints or features miss something; "
-        "see gp2 check and gp2 report",
-        fmt::join(large, ", ")));
+    notes.push_back(
+        fmt::format("warning: values differ from their prediction by all others by more than noise: {}: the noise is stated too "
+                    "small, a column is wrong or lags, a mass, a length or a force is wrong, or the constraints or features miss "
+                    "something; see gp2 check and gp2 report",
+                    fmt::join(large, ", ")));
   }
   add_far_value_note(judged, residuals, notes);
   if (small.empty()) return;
   notes.push_back(
-      fmt::format("values lie closer to what all others predict than the noise that is stated lets them: {}: it is stated too "
-                  "large, or rows share their errors, as smoothed ones do; `noise_std=estimate` finds it",
+      fmt::format("values lie closer to their prediction by all others than the stated noise allows: {}: it is stated too large, "
+                  "or rows share their errors, as smoothed ones do; `noise_std=estimate` finds it",
                   fmt::join(small, ", ")));
 }
 
@@ -278,8 +278,7 @@ std::string causes_text(const Prior& prior) {
     causes.emplace_back("a force that dissipates, which a potential does not");
   causes.emplace_back("a force that no latent stands for");
   return fmt::format(
-      "Something acts otherwise than the model has it ({}), or the rows are too few, or of one motion, for what the "
-      "model leaves open",
+      "Something differs from the model ({}), or the rows are too few, or of one motion, for what the model must learn",
       fmt::join(causes, ", "));
 }
 
@@ -290,7 +289,7 @@ struct LittlePredicted {
 };
 
 LittlePredicted little_predicted(const CrossValidation& of) {
-  if (of.predicts_little()) return {&*of.stretches, "stretches of the log that it has not seen"};
+  if (of.predicts_little()) return {&*of.stretches, "unseen stretches of the log"};
   const bool rows = is_little_predicted(of.one_by_one, of.nrmse_of_noise) && std::isfinite(of.one_by_one.nrmse);
   if (rows && !has_far_values(of)) return {&of.one_by_one, "rows left out one by one"};
   return {};
@@ -305,19 +304,19 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
     const bool is_worse_than_mean = little.part->nrmse >= 1;
     const bool is_warning = is_worse_than_mean || denies_model(cross_validation, little.part->nrmse);
     notes.push_back(fmt::format(
-        "{}of {} the fit says little{}: nrmse {:.2g}, of which the noise makes {:.2g}. {}", is_warning ? "warning: " : "",
-        little.what, is_worse_than_mean ? ", worse than their mean would" : "", little.part->nrmse, noise, causes_text(prior)));
+        "{}the fit predicts {} badly{}: nrmse {:.2g}, of which noise is {:.2g}. {}", is_warning ? "warning: " : "", little.what,
+        is_worse_than_mean ? ", worse than their mean would" : "", little.part->nrmse, noise, causes_text(prior)));
   } else if (predicts_stretches_worse(cross_validation)) {
     const Evaluation::Part& stretches = *cross_validation.stretches;
     notes.push_back(fmt::format(
-        "{}stretches of the log that were left out are predicted worse than single values: nrmse {:.2g}, not {:.2g}, of "
-        "which the noise makes {:.2g}; the intervals of 95 % hold {:.0f} %. {}",
+        "{}stretches of the log that were left out are predicted worse than single values: nrmse {:.2g}, not {:.2g}, of which "
+        "noise is {:.2g}; the 95 % intervals contain {:.0f} %. {}",
         denies_model(cross_validation, stretches.nrmse) ? "warning: " : "", stretches.nrmse, cross_validation.values.nrmse, noise,
         100 * stretches.coverage95, causes_text(prior)));
   } else if (predicts_rows_badly(cross_validation)) {
-    notes.push_back(fmt::format(
-        "rows left out one by one are predicted far worse than the noise: nrmse {:.2g}, of which the noise makes {:.2g}. {}",
-        rows.nrmse, noise, causes_text(prior)));
+    notes.push_back(
+        fmt::format("rows left out one by one are predicted far worse than the noise: nrmse {:.2g}, of which noise is {:.2g}. {}",
+                    rows.nrmse, noise, causes_text(prior)));
   }
 }
 
@@ -338,13 +337,13 @@ std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
   if (correlated.empty()) return {};
   if (last_beyond_noise(residuals)) {
     return fmt::format(
-        "residuals go on from row to row, correlation {}, and are {:.2g} times the noise: a mass, a length, a force or a "
-        "constraint of the model is wrong or missing",
+        "residuals are correlated from row to row, by {}, and {:.2g} times the noise: a mass, a length, a force or a constraint "
+        "of the model is wrong or missing",
         fmt::join(correlated, ", "), in_noise);
   }
   return fmt::format(
-      "residuals go on from row to row, correlation {}: something that lasts longer than a sample is missing, and "
-      "the rows are fewer measurements than they seem",
+      "residuals are correlated from row to row, by {}: an effect that lasts longer than a sample is missing, and the rows are "
+      "fewer independent measurements than they seem",
       fmt::join(correlated, ", "));
 }
 
@@ -403,12 +402,10 @@ void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
   Eigen::Index k = 0;
   const double worst = report.draws->r_hat.maxCoeff(&k);
   if (!(worst > HyperparameterDraws::largest_r_hat)) return;
-  notes.push_back(
-      fmt::format("the chains that draw hyperparameters have not mixed (R̂ {:.3g} of {}, near 1 where they have): they stay with "
-                  "explanations of "
-                  "their own, whose shares rest on Laplace's approximation; the same fit with another `seed` tells what it means "
-                  "for predictions",
-                  worst, report.hyperparameters[static_cast<std::size_t>(k)].name));
+  notes.push_back(fmt::format(
+      "the hyperparameter chains have not mixed (R̂ {:.3g} of {}, near 1 if they have): each stays with its own explanation, and "
+      "their weights rest on Laplace's approximation; compare predictions with those of another `seed`",
+      worst, report.hyperparameters[static_cast<std::size_t>(k)].name));
 }
 
 void add_constraint_note(const Posterior& posterior, std::vector<std::string>& notes) {
@@ -434,17 +431,16 @@ void add_constraint_note(const Posterior& posterior, std::vector<std::string>& n
   }
   if (large.empty()) return;
   notes.push_back(
-      fmt::format("warning: under a prior mean of zero the constraint alone makes far more than was measured: {}. It acts by the "
-                  "inertias, and "
-                  "on the smallest most; fit with `mean=force`, or see that the masses are right",
+      fmt::format("warning: under a prior mean of zero the constraint alone causes far more than was measured: {}. It acts "
+                  "through the inertias, most on the smallest; fit with `mean=force`, or check the masses",
                   fmt::join(large, ", ")));
 }
 
 void add_inducing_note(const InducingReport& inducing, std::vector<std::string>& notes) {
   constexpr double much = 3;  // nats
   const double left_out = 0.5 * inducing.left_out.cwiseMax(0).sum();
-  notes.push_back(fmt::format("learned through {} inducing variables: what they leave out is worth about {:.2g} nats{}",
-                              inducing.n_variables, left_out, left_out > much ? "; more may tell more (`inducing=M`)" : ""));
+  notes.push_back(fmt::format("learned with {} inducing variables: they lose about {:.2g} nats{}", inducing.n_variables, left_out,
+                              left_out > much ? "; more may help (`inducing=M`)" : ""));
 }
 
 void add_window_note(const Posterior& posterior, std::vector<std::string>& notes) {
@@ -454,10 +450,10 @@ void add_window_note(const Posterior& posterior, std::vector<std::string>& notes
     if (posterior.observations()[g].has_sums()) factor = std::max(factor, posterior.noise_stddev(g).maxCoeff());
   }
   if (!(factor > large)) return;
-  notes.push_back(fmt::format(
-      "warning: over windows of time the log deviates by {:.2g} times what the noise of its positions makes: the machine "
-      "does what the model cannot; compare a fit with `windows=none`",
-      factor));
+  notes.push_back(
+      fmt::format("warning: over time windows the log deviates by {:.2g} times the noise of its positions: something is missing "
+                  "in the model; compare a fit with `windows=none`",
+                  factor));
 }
 
 void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {

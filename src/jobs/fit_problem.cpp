@@ -185,8 +185,10 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
   }
   const auto measured = noise.array() > 0;
   const double share = noise.cwiseQuotient(scales.acceleration_stddev).sum() / static_cast<double>(measured.count());
-  return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.back(),
-          measured.select(noise, share * scales.acceleration_stddev)};
+  return {.lengthscale = Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.back(),
+          .stddev = measured.select(noise, share * scales.acceleration_stddev),
+          .centre = scales.feature_centre.back(),
+          .half_range = scales.feature_range.back() / 2};
 }
 
 // Where the noise is estimated, the discrepancy is in proportion to it: one of a guess would take its place. An acceleration that no
@@ -279,7 +281,7 @@ FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
   });
   if (paper && has_directions) {
     problem.notes.push_back(
-        "warning: `protocol=paper` has its prior on the acceleration: the directions of the model's latent are not taken");
+        "warning: `protocol=paper` has its prior on the acceleration: the directions of the model's latent are ignored");
   }
   return problem;
 }
@@ -440,7 +442,7 @@ void read_start(const NamedNumbers& start, int max_iterations, FitProblem& probl
     h.lower = std::min(bounded[k].lower, h.value);
     h.upper = std::max(bounded[k].upper, h.value);
     if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
-    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
+    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; used, because nothing is optimised",
                                         source, h.name, h.value, bounded[k].lower, bounded[k].upper));
   }
 }
@@ -454,8 +456,7 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
     const Observations& group = posterior.observations()[static_cast<std::size_t>(h.owner)];
     if (h.unit.starts_with("stated deviation") && !has_dependent_columns(posterior, group)) {
       notes.push_back(
-          fmt::format("{} ended at the lower bound: the log states deviations that are {:.2g} times as large as they "
-                      "seem, or more",
+          fmt::format("{} ended at the lower bound: the standard deviations in the log are {:.2g} times too large, or more",
                       h.name, 1 / h.lower));
     } else {
       (may_depend(posterior, group) ? dependent : without_noise).push_back(h.name);
@@ -473,8 +474,9 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
   if (!never_ran) add_few_values_note(report, posterior, notes);
   if (report.termination == FitReport::unsettled) {
     notes.emplace_back(
-        "warning: the fit has not settled: hyperparameters and the mean of latents that are not linear still changed each other. "
-        "Deviations may be far too small. Of a load and its coefficient the data may tell the product alone: give one of them");
+        "warning: the fit has not converged: hyperparameters and the mean of nonlinear latents still changed each other. "
+        "Standard deviations may be far too small. The data may determine only the product of a load and its coefficient: fix "
+        "one of them");
   }
   if (!dependent.empty()) {
     notes.push_back(
@@ -482,7 +484,7 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
                     fmt::join(dependent, ", ")));
   }
   if (!without_noise.empty()) {
-    notes.push_back(fmt::format("{} ended at the lower bound: the log has less noise than the fit can tell from none",
+    notes.push_back(fmt::format("{} ended at the lower bound: the log has less noise than the fit can distinguish from none",
                                 fmt::join(without_noise, ", ")));
   }
   return notes;
@@ -532,7 +534,8 @@ Fit fit(const FitProblem& problem, const FitOptions& options) {
 
 FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
                             const FitProblemOptions& options) {
-  if (logs.empty() && also.empty()) throw InputError("there is nothing to fit: give logs by `data`, or what is known by `also`");
+  if (logs.empty() && also.empty())
+    throw InputError("there is nothing to fit: give logs with `data`, or other knowledge with `also`");
   if (options.baseline) {
     require_baseline_options(options, logs, also);
     require_columns(model, logs, {}, options);

@@ -28,9 +28,8 @@ std::vector<Option> options(GenerateRequest& request) {
   return {
       {"n", &request.n, "N", "number of rows, drawn at random"},
       {"grid", &request.grid, "q1=5,dq1=3,…",
-       "instead of `n`: every combination of so many points of each range in [sampling], evenly from end to end; with "
-       "`noise_std=0` for test data"},
-      {"seed", &request.seed, "S", "of the random numbers; same seed, same states, whatever the noise"},
+       "instead of `n`: a grid with this many evenly spaced points in each range of [sampling]; for test data add `noise_std=0`"},
+      {"seed", &request.seed, "S", "random seed; the states do not depend on the noise"},
       {"noise_std", &request.noise_stddev, "S", "standard deviation of the noise on every ddq; 0 gives the truth",
        "the model's [noise]"},
   };

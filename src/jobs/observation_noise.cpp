@@ -85,8 +85,8 @@ void require_no_gross_errors(const Eigen::RowVectorXd& values, const std::string
   const double middle = median(measured);
   const double farthest = *std::ranges::max_element(measured, {}, [middle](double value) { return std::abs(value - middle); });
   throw InputError(
-      fmt::format("single values of {} lie far from all others, which spread by {:.3g}, not by {:.3g}: mend or leave out what "
-                  "cannot be, such as {:.6g}, or fit with `robust`",
+      fmt::format("single values of {} lie far from all others, which spread by {:.3g}, not by {:.3g}: correct or leave out "
+                  "impossible ones, such as {:.6g}, or fit with `robust`",
                   name, without, spread, farthest));
 }
 
@@ -157,7 +157,7 @@ MatrixXd stated_noise(const Model& model, const std::vector<std::string>& observ
   if (stated.empty()) return {};
   const std::vector<std::string> columns = stddev_columns(stated, reader);
   if (options.noise_stddev) {
-    notes.push_back(fmt::format("{}: `noise_std={}` stands for the deviations in {}", log.name(), *options.noise_stddev,
+    notes.push_back(fmt::format("{}: `noise_std={}` replaces the standard deviations in {}", log.name(), *options.noise_stddev,
                                 fmt::join(columns, ", ")));
     return {};
   }

@@ -100,7 +100,7 @@ bool read_value(const Json& json, const OptionValue& value) {
 }  // namespace
 
 Option threads_option(int& threads) {
-  return not_recorded({"threads", &threads, "K", "0: as many as the machine has; results do not depend on it"});
+  return not_recorded({"threads", &threads, "K", "number of threads; 0: all of the machine. Does not change the results"});
 }
 
 Option columns_option(std::map<std::string, std::string>& columns, const std::string& text) {

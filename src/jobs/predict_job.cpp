@@ -118,9 +118,7 @@ PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior,
   const ViewRequest& view = request.view;
   if (view.quantity != View::Quantity::constrained_acceleration || view.latent || view.time_step || view.system ||
       request.n_samples || request.inverse_dynamics) {
-    throw InputError(
-        "`potential` stands in the place of a view: leave `view`, `latent`, `dt`, `system`, `samples` and `inverse_dynamics` "
-        "out");
+    throw InputError("`potential` replaces a view: leave out `view`, `latent`, `dt`, `system`, `samples` and `inverse_dynamics`");
   }
   if (request.covariance == PredictRequest::Covariance::full) throw InputError("`potential` goes with `cov=none` or `cov=std`");
   const LatentRange range = latents_called(posterior.prior(), *request.potential, "`potential`");
@@ -142,7 +140,7 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
                               const PredictRequest& request) {
   const ViewRequest& view = request.view;
   if (view.quantity != View::Quantity::constrained_acceleration || view.latent || view.time_step || request.n_samples) {
-    throw InputError("`inverse_dynamics` stands in the place of a view: leave `view`, `latent`, `dt` and `samples` out");
+    throw InputError("`inverse_dynamics` replaces a view: leave out `view`, `latent`, `dt` and `samples`");
   }
   const FitSystem at = system_of(fit, posterior.prior(), view.system);
   const Eigen::VectorXd& fitted = posterior.values().parameters;
@@ -176,8 +174,8 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
   if (!request.unconditioned) add_distance(posterior, wanted.view, wanted.states, out);
   if (const Index n = is_missed.count(); n > 0) {
     out.notes.push_back(
-        fmt::format("warning: {}: no inputs produce the accelerations at {} of {} rows; those that come nearest are given, "
-                    "and what is missed: see the columns {}_missed …",
+        fmt::format("warning: {}: no inputs produce the accelerations at {} of {} rows; the nearest are given, with the "
+                    "remaining errors in columns {}_missed …",
                     log.name(), n, is_missed.size(), wanted.view.names(system).front()));
   }
   if (auto note = note_of_open_inputs(found, *at.model, log.name())) out.notes.push_back(std::move(*note));
@@ -190,9 +188,8 @@ std::optional<std::string> note_of_distance(const Eigen::VectorXd& distance) {
   const Index n_far = (distance.array() > Posterior::far_from_data).count();
   if (n_far == 0) return std::nullopt;
   return fmt::format(
-      "{} of {} states are far from the data, where deviations are too small as a rule: distance_from_data is above {:.3g}, up "
-      "to "
-      "{:.3g}",
+      "{} of {} states are far from the data, where standard deviations are usually too small: distance_from_data is above "
+      "{:.3g}, up to {:.3g}",
       n_far, distance.size(), Posterior::far_from_data, distance.maxCoeff());
 }
 
@@ -230,9 +227,8 @@ std::optional<std::string> note_of_untold(const Posterior& posterior, const Pred
   }
   if (names.empty()) return std::nullopt;
   return fmt::format(
-      "the data tell little of {}: so much is left of the variance that the prior assumes, by sizes learned from what they do "
-      "tell, "
-      "and deviations are no better than that assumption",
+      "the data hardly determine {}: this share of the prior variance is left, so standard deviations are no better than the "
+      "prior, whose size was learned from what the data do determine",
       fmt::join(names, ", "));
 }
 
@@ -259,11 +255,11 @@ std::vector<Option> options(ViewRequest& request) {
   for (const View::Quantity& quantity : View::Quantity::all()) words.emplace_back(quantity->word(), quantity);
   return {
       {"view", choice(request.quantity, words), "",
-       "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; next-velocity: "
-       "dq1_next …, with `dt`; force: force_q1 …, what was learned, as an applied force"},
+       "quantity and columns; constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; "
+       "next-velocity: dq1_next …, with `dt`; force: force_q1 …, the learned applied force"},
       {"dt", &request.time_step, "SECONDS", "time step of next-velocity [s]"},
       {"latent", &request.latent, "NAME",
-       "only what this latent adds to the view, by its name: NAME@LATENT; the small one that a fit adds is called discrepancy"},
+       "only the contribution of this latent, in columns NAME@LATENT; the latent added by gp2 fit is called discrepancy"},
   };
 }
 
@@ -293,18 +289,17 @@ std::vector<Option> options(PredictRequest& request) {
   return joined(
       {options(request.view),
        {{"cov", choice(request.covariance, {{"none", Covariance::none}, {"std", Covariance::stddev}, {"full", Covariance::full}}),
-         "", "none; std: NAME_std; full: also cov_NAME1_NAME2, the upper triangle. Without measurement noise"},
+         "", "uncertainty, without measurement noise; std: columns NAME_std; full: also cov_NAME1_NAME2, the upper triangle"},
         {"samples", &request.n_samples, "S",
-         "draws of all rows together: NAME_sample1 … NAME_sampleS; time grows with the cube of the rows", "", "n_samples"},
-        {"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"},
-        {"unconditioned", &request.unconditioned, "",
-         "predict from the prior under the fitted hyperparameters, as if there had been no data"},
+         "number of joint samples over all rows: NAME_sample1 … NAME_sampleS; time grows with the cube of the number of rows", "",
+         "n_samples"},
+        {"seed", &request.seed, "K", "random seed of the samples", "", "", "", "samples"},
+        {"unconditioned", &request.unconditioned, "", "predict from the prior with the fitted hyperparameters, without the data"},
         {"inverse_dynamics", &request.inverse_dynamics, "",
-         "instead of a view: the inputs that produce the accelerations ddq1 … which the CSV has, u1 …, and ddq1_missed …, "
-         "what is missed of them"},
+         "instead of a view: the inputs u1 … that produce the accelerations ddq1 … of the CSV, and the remaining errors "
+         "ddq1_missed …"},
         {"potential", &request.potential, "NAME",
-         "instead of a view: the energy of the latent of this name, which the model has as a potential, less that at the "
-         "first row: potential@NAME [J], known up to a constant"},
+         "instead of a view: the energy of this potential latent, relative to the first row: potential@NAME [J]"},
         columns_option(request.columns)}});
 }
 
@@ -317,8 +312,8 @@ std::optional<std::string> note_of_open_inputs(const InverseDynamics& found, con
   }
   if (names.empty()) return std::nullopt;
   return fmt::format(
-      "{}: the accelerations that are wanted do not determine {} at {} of {} rows; the least change of inputs is "
-      "given, and its deviations tell nothing of other inputs that do the same",
+      "{}: the desired accelerations do not determine {} at {} of {} rows; the smallest change of inputs is given, and its "
+      "standard deviations do not cover other inputs with the same effect",
       states, fmt::join(names, ", "), open.colwise().any().count(), open.cols());
 }
 

@@ -194,7 +194,7 @@ std::string unrelated(const Steps& steps) {
   const Eigen::GeneralizedSelfAdjointEigenSolver<Eigen::Matrix2d> least((next + next.transpose()) / 2, at_once,
                                                                         Eigen::EigenvaluesOnly);
   if (!(least.eigenvalues()[0] > lasting)) return "";
-  return fmt::format("{:.0f} % of what is measured is neither it nor noise: another column?", 100 * unexplained);
+  return fmt::format("{:.0f} % of what is measured is neither this rate nor noise: another column?", 100 * unexplained);
 }
 
 }  // namespace
@@ -207,8 +207,8 @@ std::string better_rate(const RateColumns& columns) {
   while (columns.t.size() > 2 * length * enough_steps && rows.steps(own, 0, 2 * length).tell(0.5)) length *= 2;
   const Steps now = rows.steps(own, 0, length);
   if (const std::optional<double> o = offset(now)) {
-    return fmt::format("what is measured lies {:.3g} {} it throughout: the zero of a sensor, or gravity that it feels",
-                       std::abs(*o), *o > 0 ? "above" : "below");
+    return fmt::format("what is measured lies {:.3g} {} it throughout: a sensor offset, or measured gravity", std::abs(*o),
+                       *o > 0 ? "above" : "below");
   }
   if (!now.tell(1)) return "";
   const auto is_sure = [](const Steps& steps) { return steps.tell(1) && std::abs(steps.correlation()) > surely_correlated; };
@@ -341,7 +341,7 @@ std::optional<std::string> far_values_text(const std::string& input, const std::
     }
   }
   if (far.empty()) return std::nullopt;
-  return fmt::format("single values of the input {} lie far from all others: {}. Mend them, or leave these rows out", input,
+  return fmt::format("single values of the input {} lie far from all others: {}. Correct them, or leave these rows out", input,
                      fmt::join(far, ", "));
 }
 

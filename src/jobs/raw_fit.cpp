@@ -293,13 +293,12 @@ double total_gain(const DerivedData& data) {
 }  // namespace
 
 std::vector<Option> options(RawFitOptions& options) {
-  std::vector<Option> table = {
-      {"passes", &options.most_passes, "K",
-       "smooth the raw log anew by what was learned from it, at most so often, and as long as positions "
-       "that the fit has not seen get likelier; 0: smooth, then learn"},
-      {"windows", Switch{&options.windows, "auto", "none"}, "",
-       "learn from what positions tell of accelerations over windows of time, without differentiating them "
-       "(docs/theory.md, T36), where that can be; or none: from rows of the smoothed log"}};
+  std::vector<Option> table = {{"passes", &options.most_passes, "K",
+                                "maximum number of times to smooth the raw log again with the learned dynamics, as long as the "
+                                "likelihood of held-out positions increases; 0: smooth once"},
+                               {"windows", Switch{&options.windows, "auto", "none"}, "",
+                                "data to learn from; auto: if possible, averages of the acceleration over time windows, computed "
+                                "from positions without differentiation (docs/theory.md, T36); none: rows of the smoothed log"}};
   static constexpr std::array left_out = {"rate", "every", "hold_constraints", "keep", "map"};
   for (Option& option : gp2::options(options.derive)) {
     if (std::find(left_out.begin(), left_out.end(), option.name) == left_out.end()) table.push_back(std::move(option));
@@ -331,6 +330,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
   const System& system = *request.model.system;
   DeriveOptions smoothing = options.derive;
   smoothing.columns = request.problem.columns;
+  smoothing.stop = stop;
   const auto with_rows = [&](DerivedData data) {
     LearnedLog out{std::move(data), {}, {}, {}, {}};
     const CsvTable table = as_table(out.data, system, log.name());
@@ -354,7 +354,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     quick.standard_errors = quick.thin = quick.problem.robust = false;
     const FitJob job = prepare_fit(std::move(quick));
     const FitOutcome fit = run_fit(job, {}, stop);
-    if (stop != nullptr && *stop) throw NumericalError("stopped while the raw log was learned from");
+    if (stop != nullptr && *stop) throw NumericalError("stopped while learning from the raw log");
     actuators = fit.file.model.actuators;
     last = {fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole)};
   };
@@ -383,10 +383,10 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
       try {
         sensitivities = sensitivities_of(last->posterior, learned.data, last->states, choice.rows());
       } catch (const InputError& error) {
-        learned.notes.push_back(fmt::format(
-            "warning: errors of the smoothed states count as nothing beside the noise of windows, since accelerations "
-            "near these states are unknown: {} Standard errors may be too small; compare a fit with `windows=none`",
-            error.what()));
+        learned.notes.push_back(
+            fmt::format("warning: errors of the smoothed states are neglected in the noise of windows, since accelerations near "
+                        "these states are unknown: {} Standard errors may be too small; compare a fit with `windows=none`",
+                        error.what()));
       }
     }
     learned.rows = choice.rows();
@@ -409,13 +409,11 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     gains.push_back(gain);
     best = std::exchange(next, std::move(after));
   }
-  best.notes.push_back(
-      gains.empty()
-          ? "learning from a smoothing by what was learned makes positions that the fit has not seen no likelier: it is not kept"
-          : fmt::format(
-                "smoothed by what was learned, {} times: log likelihood of positions that the fits have not seen + {:.4g}, "
-                "learned from that + {:.4g}",
-                gains.size(), first, fmt::join(gains, ", + ")));
+  best.notes.push_back(gains.empty()
+                           ? "smoothing with the learned dynamics does not make held-out positions likelier: it is not used"
+                           : fmt::format("smoothed {} times with the learned dynamics: log likelihood of held-out positions + "
+                                         "{:.4g}, learned from that + {:.4g}",
+                                         gains.size(), first, fmt::join(gains, ", + ")));
   best.gains = std::move(gains);
   return with_windows(std::move(best));
 }

@@ -136,10 +136,10 @@ void check_options(const DeriveOptions& options) {
 RawLog::RawLog(const Model& model, const CsvTable& log, const DeriveOptions& options)
     : system_(*model.system), log_(log), options_(options), reader_(open_log(model, log, options.columns)) {
   if (!contacts_of(model, system_.parameter_values()).empty()) {
-    throw InputError(fmt::format(
-        "{}: '{}' has contacts, at whose impacts velocities jump, so that positions are not smoothed across them: give a "
-        "log with velocities and accelerations, or raw logs of stretches without an impact and a model without contacts",
-        log.name(), system_.name()));
+    throw InputError(
+        fmt::format("{}: '{}' has contacts: velocities jump at impacts, so positions cannot be smoothed across them; give a log "
+                    "with velocities and accelerations, or raw logs of stretches without an impact and a model without contacts",
+                    log.name(), system_.name()));
   }
   check_options(options);
   find_columns();
@@ -250,7 +250,7 @@ double RawLog::unit_of(double usual_step) {
     return automatic ? usual_step < one.below : one.unit == options_.time_unit;
   });
   if (automatic && unit.unit != TimeUnit::seconds) {
-    notes.push_back(fmt::format("{} is taken to count {}: its usual step is {:.6g}; `time_unit=s` if these are seconds",
+    notes.push_back(fmt::format("{} is assumed to be in {}: its usual step is {:.6g}; give `time_unit=s` if it is in seconds",
                                 place_of(time_column_), unit.name, usual_step));
   }
   return unit.seconds;
@@ -299,7 +299,7 @@ void RawLog::split_at_pauses() {
   }
   if (n_pauses > 0) {
     notes.push_back(fmt::format(
-        "warning: {} pauses {}, for {:.3g} s at most: each part is smoothed by itself{}", place_of(time_column_),
+        "warning: {} pauses {}, for {:.3g} s at most: each part is smoothed separately{}", place_of(time_column_),
         n_pauses == 1 ? "once" : fmt::format("{} times", n_pauses), longest,
         n_left_out > 0 ? fmt::format("; {} rows of parts that are too short, or where nothing moves, are left out", n_left_out)
                        : ""));
@@ -356,8 +356,7 @@ void RawLog::unwrap(const Episode& episode, int column, Channel& channel) {
   std::vector<double> values = values_of(channel.measurements);
   if (is_wrapped_in_degrees(values)) {
     throw InputError(
-        fmt::format("{}{} jumps by 360 from sample to sample: it is in degrees, and an angle is in rad. "
-                    "Convert it",
+        fmt::format("{}{} jumps by 360 from sample to sample: it is in degrees, but angles must be in rad. Convert it",
                     place_of(column), in_episode(episode)));
   }
   // single errors do not count
@@ -397,8 +396,8 @@ void RawLog::require_motion(const Episode& episode, int column, const Channel& c
   const double first = channel.measurements.front().value;
   if (std::all_of(channel.measurements.begin(), channel.measurements.end(),
                   [&](const Measurement& one) { return one.value == first; })) {
-    throw InputError(fmt::format("{}: all {} values are {}: nothing moves, which tells neither velocity nor noise{}", where,
-                                 channel.measurements.size(), first, way_out));
+    throw InputError(fmt::format("{}: all {} values are {}: nothing moves, so there is neither velocity nor noise to find{}",
+                                 where, channel.measurements.size(), first, way_out));
   }
 }
 

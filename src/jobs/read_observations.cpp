@@ -117,8 +117,8 @@ void keep_known(const std::optional<CommandedRows>& commanded, const CsvTable& l
   if (n == 0) return;
   if (rows.empty()) {
     throw InputError(
-        fmt::format("{}: at none of its rows is known what acts: inputs are so late that all depend on commands before "
-                    "the log; give the whole log as `commands`, a longer one, or narrower bounds of delays and lags",
+        fmt::format("{}: the acting inputs are not known at any row: they all depend on commands before the log; give the whole "
+                    "log as `commands`, a longer one, or narrower bounds of delays and lags",
                     log.name()));
   }
   notes.push_back(unknown_text(log, n, "left out"));
@@ -168,16 +168,16 @@ std::vector<int> measured_rows(Readings& readings, const std::vector<std::string
     const Index n = values.row(k).array().isNaN().count();
     if (n == 0) continue;
     missing.push_back(fmt::format("{} of {} of {}{}", n, log.n_rows(), names[static_cast<std::size_t>(k)],
-                                  n_without > 0 ? fmt::format(" ({} for want of a deviation)", n_without) : ""));
+                                  n_without > 0 ? fmt::format(" ({} without a standard deviation)", n_without) : ""));
   }
   if (missing.empty()) return counted(log.n_rows());
-  notes.push_back(fmt::format("{}: values not measured, their cells being empty: {}", log.name(), fmt::join(missing, ", ")));
+  notes.push_back(fmt::format("{}: values not measured (empty cells): {}", log.name(), fmt::join(missing, ", ")));
   std::vector<int> rows;
   for (int i = 0; i < log.n_rows(); ++i) {
     if (!values.col(i).array().isNaN().all()) rows.push_back(i);
   }
   const std::size_t n_left_out = static_cast<std::size_t>(log.n_rows()) - rows.size();
-  if (n_left_out > 0) notes.push_back(fmt::format("{}: {} rows left out: they measure nothing", log.name(), n_left_out));
+  if (n_left_out > 0) notes.push_back(fmt::format("{}: {} rows left out: they have no measured value", log.name(), n_left_out));
   return rows;
 }
 
@@ -260,8 +260,8 @@ void project(const System& system, const VectorXd& parameters, const CsvTable& l
     }
     if (lines.size() < projected.failures.size()) lines.emplace_back("…");
     throw InputError(fmt::format(
-        "`project`: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
-        "these rows, or see gp2 check",
+        "`project`: {}: {} of {} states have no state on the constraints near them (line {}): {}; correct or leave out these "
+        "rows, or see gp2 check",
         log.name(), projected.failures.size(), log.n_rows(), fmt::join(lines, ", "), projected.failures.front().text));
   }
   const std::vector<std::string> names = system.state_names();
@@ -289,8 +289,8 @@ std::vector<std::string> observed_accelerations(const System& system, const FitP
   };
   if (!std::all_of(stated.begin(), stated.end(), is_empty)) std::erase_if(stated, is_empty);
   if (!stated.empty() && stated.size() < system.coordinates().size()) {
-    notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with `observe`", log.name(),
-                                fmt::join(stated, ", ")));
+    notes.push_back(fmt::format("{}: observes {}: the log has standard deviations of these only; others with `observe`",
+                                log.name(), fmt::join(stated, ", ")));
   }
   return stated;
 }
@@ -333,8 +333,8 @@ void note_dependence(const LoggedSystem& logged, const Readings& readings, const
   std::vector<std::string> names;
   for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
   notes.push_back(
-      fmt::format("warning: {}: the accelerations obey A ddq = b, or a part of it, far better than noise lets them: they are "
-                  "not {} independent measurements but {}; observe independent rows only, say `observe={}`",
+      fmt::format("warning: {}: the accelerations satisfy A ddq = b, or part of it, far more closely than noise allows: they are "
+                  "not {} independent measurements but {}; observe independent ones only, say `observe={}`",
                   log.name(), every.size(), independent->size(), fmt::join(names, ",")));
 }
 
@@ -343,7 +343,7 @@ void note_repeats(const Readings& readings, const CsvTable& log, std::vector<std
   const int n_repeated = n_repeated_rows({{readings.states, readings.values}});
   if (n_repeated * 20 <= log.n_rows()) return;
   notes.push_back(fmt::format(
-      "warning: {}: {} of {} rows repeat another one to the last digit: deviations come out too small; keep each once",
+      "warning: {}: {} of {} rows repeat another one to the last digit: standard deviations will be too small; keep each once",
       log.name(), n_repeated, log.n_rows()));
 }
 
@@ -419,8 +419,8 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
     const double step = out.record->usual_step();
     if (step > lateness && out.record->usual_change() * lateness > little * step) {
       notes.push_back(
-          fmt::format("warning: {}: rows are {:.3g} s apart as a rule, inputs at most {:.3g} s late: what acts in between is not "
-                      "known; log faster, or, where these are rows of a longer log, give that as `commands`",
+          fmt::format("warning: {}: rows are usually {:.3g} s apart, inputs at most {:.3g} s late: what acts in between is not "
+                      "known; log faster, or, if these are rows of a longer log, give that as `commands`",
                       reader.table().name(), out.record->usual_step(), lateness));
     }
   }
@@ -473,7 +473,7 @@ std::string text_of_rest(const Model& model, const VectorXd& parameters, const M
   }
   if (n * 20 <= states.cols()) return {};
   return fmt::format(
-      "{} of {} rows are at rest where dry friction jumps, at {} = 0: what holds a body there is no function of its state; "
+      "{} of {} rows are at rest where dry friction jumps, at {} = 0: the friction force there is no function of the state; "
       "leave them out",
       n, states.cols(), fmt::join(names, "; "));
 }
@@ -537,8 +537,8 @@ void note_shared_rows(const std::vector<Observations>& known, const std::vector<
   const int n = n_shared(groups) - n_before;
   if (n * 20 <= n_states(more)) return;
   notes.push_back(fmt::format(
-      "warning: {} of {} rows stand in another log too, to the last digit: deviations come out too small; give each once", n,
-      n_states(more)));
+      "warning: {} of {} rows are also in another log, to the last digit: standard deviations will be too small; give each once",
+      n, n_states(more)));
 }
 
 LoggedSystem logged_system(const Model& fitted, const std::vector<Actuator>& actuators, const Prior& prior,
@@ -667,7 +667,7 @@ LatentRange latents_called(const Prior& prior, const std::string& name, const st
     return {static_cast<int>(first - all.begin()), static_cast<int>(std::count(first, all.end(), name))};
   }
   all.erase(std::unique(all.begin(), all.end()), all.end());
-  throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(all, ", ")));
+  throw InputError(fmt::format("{}: no latent is called '{}'; there are: {}", option, name, fmt::join(all, ", ")));
 }
 
 std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
@@ -699,10 +699,10 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
     out.accelerations.col(static_cast<Index>(i)).setConstant(not_a_number);
   }
   if (n_unknown > 0 && accelerations.empty() && !begins_at_rest) {
-    out.notes.push_back(fmt::format(
-        "warning: {}: {} of {} rows are predicted as if the inputs had been at rest before, but they do not begin so: "
-        "what acts there depends on commands before the log",
-        log.name(), n_unknown, log.n_rows()));
+    out.notes.push_back(
+        fmt::format("warning: {}: {} of {} rows are predicted as if the inputs had been at rest before, but the log does not "
+                    "begin at rest: what acts there depends on commands before the log",
+                    log.name(), n_unknown, log.n_rows()));
   } else if (n_unknown > 0) {
     out.notes.push_back(
         unknown_text(log, n_unknown, accelerations.empty() ? "as if the inputs had been at rest before" : "left out"));
@@ -726,7 +726,7 @@ WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const Cs
     if (reader.has(every[static_cast<std::size_t>(j)])) view.rows.push_back(j);
   }
   if (view.rows.empty()) {
-    throw InputError(fmt::format("{}: has none of the columns {}, the accelerations that are wanted; it has: {}", log.name(),
+    throw InputError(fmt::format("{}: has none of the columns {}, the desired accelerations; it has: {}", log.name(),
                                  fmt::join(every, ", "), fmt::join(log.header(), ", ")));
   }
   // inputs are what is looked for, but for those of sensors
@@ -769,10 +769,10 @@ std::vector<std::string> ActingStates::idle_texts() const {
   std::vector<std::string> warnings;
   for (std::size_t a = 0; a < acts_.size() && n_states_ > 0; ++a) {
     if (acts_[a]) continue;
-    warnings.push_back(fmt::format(
-        "latent '{}' acts at 0 of {} states: its direction is 0 there, and nothing is learned of it; look at the sign "
-        "of its load, or at the condition under which it acts",
-        names_[a], n_states_));
+    warnings.push_back(
+        fmt::format("latent '{}' acts at 0 of {} states: its direction is 0, and nothing is learned of it; check the sign of its "
+                    "load, or the condition under which it acts",
+                    names_[a], n_states_));
   }
   return warnings;
 }
@@ -801,10 +801,9 @@ std::vector<std::string> shared_load_texts(const Model& model, const System& sys
     for (const char* name : {"lambda0", "lambda"}) {
       const std::string variable = fmt::format("{}({})", name, row + 1);
       if (!is_shared[static_cast<std::size_t>(row)] || !read.contains(variable)) continue;
-      warnings.push_back(
-          fmt::format("{}: the constraint '{}' follows from others, so that nothing tells its share of the load: remove the rows "
-                      "that repeat others",
-                      variable, system.constraint_labels()[static_cast<std::size_t>(row)]));
+      warnings.push_back(fmt::format(
+          "{}: the constraint '{}' follows from others, so that its share of the load is undetermined: remove redundant rows",
+          variable, system.constraint_labels()[static_cast<std::size_t>(row)]));
     }
   }
   return warnings;
@@ -827,8 +826,8 @@ std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Mo
   if (!not_in_log.empty())
     notes.push_back(fmt::format("{}: not compared: {}, which it lacks", log.name(), fmt::join(not_in_log, ", ")));
   if (!not_observed.empty()) {
-    notes.push_back(fmt::format("{}: not compared: {}, which the fit did not observe; compare what you like with `outputs`",
-                                log.name(), fmt::join(not_observed, ", ")));
+    notes.push_back(fmt::format("{}: not compared: {}, which the fit did not observe; choose others with `outputs`", log.name(),
+                                fmt::join(not_observed, ", ")));
   }
   return outputs;
 }

@@ -42,8 +42,8 @@ void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
   }
   if (n_finite >= 3 && n_best <= 1) {
     advice.push_back({Level::note,
-                      n_best == 1 ? fmt::format("Only one of {} restarts reached the optimum taken.", report.restarts.size())
-                                  : "No restart reached the optimum taken: a scan from the best of them found it.",
+                      n_best == 1 ? fmt::format("Only one of {} restarts reached the best optimum.", report.restarts.size())
+                                  : "No restart reached the best optimum: a scan from the best of them found it.",
                       "There may be a better one that none has reached: fit with more `restarts` and compare the objective."});
   }
 }
@@ -63,7 +63,7 @@ void bound_advice(const FitReport& report, std::vector<Advice>& advice) {
     }
   }
   if (!short_lengthscales.empty()) {
-    advice.push_back({Level::note, fmt::format("As short as is allowed: {}.", fmt::join(short_lengthscales, ", ")),
+    advice.push_back({Level::note, fmt::format("At the lower bound: {}.", fmt::join(short_lengthscales, ", ")),
                       "The latent changes from row to row there: it explains noise by wiggles, or takes up steps, single "
                       "values that are wrong (`robust`), or what another feature would say. Look at the residuals against that "
                       "feature; a smaller bound makes it worse."});
@@ -109,13 +109,12 @@ void relevance_advice(const Report& report, std::vector<Advice>& advice) {
       advice.push_back({Level::note, fmt::format("No feature of '{}' matters: it is as good as constant.", latent),
                         "The known part of the model explains the data already, or the features are not those that count."});
     } else {
-      advice.push_back(
-          {Level::note,
-           fmt::format("Of '{}', the {} {} hardly {}: the lengthscale is far beyond the spread in the data.", latent,
-                       features.size() == 1 ? "feature" : "features", fmt::join(features, ", "),
-                       features.size() == 1 ? "matters" : "matter"),
-           "Left out of the latent's features, the model is smaller and faster; or, if you expect an effect, take data "
-           "with more variation there."});
+      advice.push_back({Level::note,
+                        fmt::format("Of '{}', the {} {} hardly {}: the lengthscale is far beyond the spread in the data.", latent,
+                                    features.size() == 1 ? "feature" : "features", fmt::join(features, ", "),
+                                    features.size() == 1 ? "matters" : "matter"),
+                        "Leaving out such features makes the model smaller and faster; if you expect an effect, take data with "
+                        "more variation there."});
     }
   }
 }
@@ -136,8 +135,8 @@ void constraint_advice(const Report& report, std::vector<Advice>& advice) {
                    "its scale.",
                    fmt::join(names, " and "), violation.state + 1, worst->name, violation.constraint, violation.value,
                    violation.relative),
-       "A little is measurement noise, or parameters that were estimated, and does no harm. Much means wrong units, "
-       "signs or offsets of a column, or wrong parameters of the constraint: estimate them with `estimate`."});
+       "Small values are measurement noise, or estimated parameters, and do no harm. Large ones mean wrong units, signs or "
+       "offsets of a column, or wrong parameters of the constraint: estimate them with `estimate`."});
 }
 
 void rank_advice(const Report& report, std::vector<Advice>& advice) {
@@ -159,8 +158,8 @@ void independence_advice(const Report& report, std::vector<Advice>& advice) {
     if (data.independent.empty()) continue;
     advice.push_back(
         {Level::warning,
-         fmt::format("The accelerations of the {} data follow from each other: they obey the constraint, or a part of it, far "
-                     "better than noise lets them.",
+         fmt::format("The accelerations of the {} data follow from each other: they satisfy the constraint, or part of it, far "
+                     "more closely than noise allows.",
                      data.name),
          fmt::format("They are not independent measurements. Fit with `observe={}`.", fmt::join(data.independent, ","))});
   }
@@ -171,10 +170,9 @@ void residual_advice(const Report& report, std::vector<Advice>& advice) {
   for (const ReportData& data : report.data) {
     for (const ConstraintResidual& one : data.constraint_residuals) {
       if (!data.is_test || !one.is_too_large()) continue;
-      advice.push_back(
-          {Level::warning, fmt::format("The {} data deny a constraint: {}.", data.name, one.text()),
-           "Until that is found nothing else on this page means much: look at the rows named, at units, signs and frames "
-           "of the columns, and at the constants of the constraint."});
+      advice.push_back({Level::warning, fmt::format("The {} data violate a constraint: {}.", data.name, one.text()),
+                        "Until the cause is found, the rest of this page means little: check the rows named, units, signs and "
+                        "frames of the columns, and the constants of the constraint."});
     }
   }
 }
@@ -188,7 +186,8 @@ std::string noise_mend(const Report& report, const char* too) {
         return any;
       });
   if (!is_stated) return fmt::format("the noise is too {}: `noise_std=estimate`", too);
-  return fmt::format("the deviations in the log's columns NAME_std are too {}, and one factor for all does not mend them", too);
+  return fmt::format(
+      "the standard deviations in the log's columns NAME_std are too {}, and one factor for all does not correct them", too);
 }
 
 // Single errors far beyond the bands, and errors that follow a feature.
@@ -205,9 +204,9 @@ void error_shape_advice(const ReportData& data, std::vector<Advice>& advice) {
     constexpr double far = 6;  // of a million Gaussian values none
     if (farthest != known.end() && std::abs(z(k, *farthest)) > far) {
       advice.push_back({Level::warning,
-                        fmt::format("At row {} of the {} data {} is off by {:.2g} deviations.", *farthest + 1, data.name, output,
-                                    std::abs(z(k, *farthest))),
-                        "An outlier of the log, or a state of which training knows nothing while the fit is sure of itself."});
+                        fmt::format("At row {} of the {} data {} is off by {:.2g} standard deviations.", *farthest + 1, data.name,
+                                    output, std::abs(z(k, *farthest))),
+                        "An outlier of the log, or a state far from training at which the fit is overconfident."});
     }
     const double n = static_cast<double>(known.size());
     for (const auto& feature : data.features) {
@@ -277,7 +276,7 @@ void test_advice(const Report& report, const ReportData& data, std::vector<Advic
         {Level::warning,
          fmt::format("{:.0f} % of the test states are far from those of training: nrmse {:.3g} there, {:.3g} at the others.",
                      100.0 * e.far.n / e.n, e.far.nrmse, e.near.nrmse),
-         "Deviations are too small there as a rule. Take training data where the test goes."});
+         "Standard deviations are usually too small there. Take training data where the test goes."});
     return;
   }
   const double ratio = e.rmse.norm() / training.evaluation.rmse.norm();
@@ -307,10 +306,10 @@ std::vector<Advice> learning_advice(const Report& report) {
   relevance_advice(report, advice);
   std::stable_sort(advice.begin(), advice.end(), [](const Advice& a, const Advice& b) { return a.level > b.level; });
   if (advice.empty()) {
-    advice.push_back({Level::good, "Nothing to mend was found.",
+    advice.push_back({Level::good, "No problem was found.",
                       report.data.empty() || !report.data.back().is_test
                           ? "The training data cannot show everything: give `data` of a run that the fit has not seen."
-                          : "Look at the pictures all the same: no rule sees what an eye sees."});
+                          : "Look at the pictures all the same: not everything is tested."});
   }
   return advice;
 }

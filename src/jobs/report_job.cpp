@@ -452,10 +452,10 @@ std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system
 
 std::vector<Option> options(ReportOptions& options) {
   return {
-      {"data", &options.data, "CSV", "CSV with states and accelerations that the fit has not seen: a test"},
+      {"data", &options.data, "CSV", "test log: CSV with states and accelerations that the fit has not seen"},
       {"system", &options.system, "OTHER.toml",
-       "model file of another system with the same coordinates, inputs and latents, which `data` and `truth` are of", "", "", "",
-       "data"},
+       "model file of the system of `data` and `truth`, if it is another one with the same coordinates, inputs and latents", "",
+       "", "", "data"},
       {"truth", &options.truth, "MODEL", "model file whose [truth] is the true acceleration, shown beside the prediction"},
       columns_option(options.columns, "columns of `data` by other names"),
   };

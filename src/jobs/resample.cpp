@@ -8,6 +8,7 @@
 #include <fmt/format.h>
 
 #include "base/random.hpp"
+#include "base/stop.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -22,13 +23,14 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
-FarthestPoints farthest_points(const Ref<const MatrixXd>& points, int n, int first) {
+FarthestPoints farthest_points(const Ref<const MatrixXd>& points, int n, int first, const std::atomic<bool>* stop) {
   FarthestPoints out;
   out.distance = VectorXd::Zero(n);
   // squares of distances from the nearest chosen point; −1 at the chosen ones, so that none is chosen twice
   VectorXd nearest = VectorXd::Constant(points.cols(), std::numeric_limits<double>::infinity());
   Index next = first;
   for (int k = 0; k < n; ++k) {
+    require_not_stopped(stop);
     if (k > 0) out.distance[k] = std::sqrt(nearest.maxCoeff(&next));
     out.chosen.push_back(static_cast<int>(next));
     nearest = nearest.cwiseMin((points.colwise() - points.col(next)).colwise().squaredNorm().transpose());
@@ -112,14 +114,14 @@ MatrixXd standardised(const MatrixXd& values) {
 
 std::vector<Option> options(ResampleOptions& options) {
   return {
-      {"features", &options.features, "q1,dq1,…", "expressions of the model's symbols to measure by",
+      {"features", &options.features, "q1,dq1,…", "expressions in which distances are measured",
        "the features of the model's latents"},
-      {"seed", &options.seed, "S", "start at a random row", "at the row nearest to the mean"},
+      {"seed", &options.seed, "S", "random seed to choose the first row", "none: the row nearest to the mean"},
       columns_option(options.columns),
   };
 }
 
-Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options) {
+Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options, const std::atomic<bool>* stop) {
   if (options.n < 1) throw InputError(fmt::format("resample: n must be positive, got {}", options.n));
   Features features = features_of(model, options.features);
   std::vector<bool> reads;
@@ -153,7 +155,7 @@ Resample resample(const Model& model, const CsvTable& log, const ResampleOptions
   } else {
     points.colwise().squaredNorm().minCoeff(&first);
   }
-  FarthestPoints farthest = farthest_points(points, options.n, static_cast<int>(first));
+  FarthestPoints farthest = farthest_points(points, options.n, static_cast<int>(first), stop);
 
   Resample out{{}, std::move(farthest.distance), farthest.radius, std::move(features.names), log.n_rows() - n_usable};
   for (const int chosen : farthest.chosen) out.rows.push_back(usable[static_cast<std::size_t>(chosen)]);

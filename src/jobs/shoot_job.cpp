@@ -16,6 +16,7 @@
 
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
+#include "base/stop.hpp"
 #include "data/evenly.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
@@ -50,13 +51,14 @@ struct Linearised {
 
 class Shooter {
  public:
-  Shooter(const FitFile& fit, const CsvTable& log, const ShootRequest& request)
+  Shooter(const FitFile& fit, const CsvTable& log, const ShootRequest& request, const std::atomic<bool>* stop)
       : fit_(fit),
         prior_(fit.prior()),
         system_(*fit.model.system),
         view_(View::constrained_acceleration(system_)),
         switching_(switching_functions(fit.model, /*of_latents=*/true)),
         n_threads_(thread_count(request.threads)),
+        stop_(stop),
         hyperparameters_(fit.report.hyperparameters) {
     find_parameters();
     note_rows_that_are_gone(notes_);
@@ -132,20 +134,20 @@ class Shooter {
       if (difference > far) apart.push_back(fmt::format("{}, {:.2g} joint standard errors", one.name, difference));
     }
     if (!has_errors()) {
-      out.notes.push_back(fmt::format(
-          "warning: no standard errors: they come from how {} stretches or more differ. A shorter `duration` or a longer log",
-          least_stretches));
+      out.notes.push_back(
+          fmt::format("warning: no standard errors: they need {} stretches or more. Use a shorter `duration` or a longer log",
+                      least_stretches));
     }
     if (!off.empty()) {
       out.notes.push_back(
-          fmt::format("warning: the motion stays farther off than errors of the log and of the latents let it: {}: an input, a "
+          fmt::format("warning: the motion is farther off than errors of the log and of the latents explain: {}: an input, a "
                       "column or a force is wrong, or stretches are too long",
                       fmt::join(off, "; ")));
     }
     if (!apart.empty()) {
       out.notes.push_back(
-          fmt::format("warning: the motion tells other values than the accelerations did: {}: the log is not of the machine "
-                      "that was fitted, smoothing changed its accelerations, or the model lacks something",
+          fmt::format("warning: the motion gives other values than the accelerations: {}: the log is not of the machine that was "
+                      "fitted, smoothing changed its accelerations, or the model lacks something",
                       fmt::join(apart, "; ")));
     }
   }
@@ -287,6 +289,7 @@ class Shooter {
   }
 
   [[nodiscard]] Posterior posterior_at(const std::vector<Hyperparameter>& hyperparameters) const {
+    require_not_stopped(stop_);
     ModelValues values = model_values(prior_, fit_.observations, hyperparameters);
     if (fit_.report.inducing) values.inducing = fit_.report.inducing->points;
     return {prior_, fit_.observations, std::move(values)};
@@ -301,7 +304,10 @@ class Shooter {
   template <typename Function>
   [[nodiscard]] std::optional<VectorXd> residual(const Function& function, const VectorXd& parameters, const Stretch& stretch,
                                                  const VectorXd& start) const {
-    const Acceleration acceleration = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view_, x).col(0); };
+    const Acceleration acceleration = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+      require_not_stopped(stop_);
+      return function(view_, x).col(0);
+    };
     SimulateOptions options;
     options.times = times().segment(stretch.first, stretch.size).transpose();
     options.relative_tolerance = 1e-8;
@@ -328,6 +334,7 @@ class Shooter {
         }
       }
     } catch (const NumericalError&) {
+      require_not_stopped(stop_);
       return std::nullopt;
     }
     if (!off.allFinite()) return std::nullopt;
@@ -484,12 +491,13 @@ class Shooter {
       step.J.push_back(std::move(J));
     }
     const VectorXd unit = A.diagonal().cwiseSqrt();
-    if (!(unit.minCoeff() > 0)) throw NumericalError(fmt::format("the motions do not tell apart: {}", fmt::join(names(), ", ")));
+    if (!(unit.minCoeff() > 0))
+      throw NumericalError(fmt::format("the motions do not determine separately: {}", fmt::join(names(), ", ")));
     const auto scaled = unit.cwiseInverse().asDiagonal();
     const MatrixXd correlation = scaled * A * scaled;
     constexpr double determined = 1e-10;
     if (!(Eigen::SelfAdjointEigenSolver<MatrixXd>(correlation).eigenvalues()[0] > determined))
-      throw NumericalError(fmt::format("the motions do not tell apart: {}", fmt::join(names(), ", ")));
+      throw NumericalError(fmt::format("the motions do not determine separately: {}", fmt::join(names(), ", ")));
     step.inverse = scaled * correlation.inverse() * scaled;
     // the jackknife; of what one stretch alone says it knows nothing
     VectorXd scatter = VectorXd::Zero(p);
@@ -587,6 +595,7 @@ class Shooter {
   View view_;
   SwitchingFunctions switching_;
   int n_threads_;
+  const std::atomic<bool>* stop_;
   std::vector<Hyperparameter> hyperparameters_;
   std::vector<std::size_t> parameters_;  // that are estimated, among the hyperparameters
   std::vector<int> compared_;            // coordinates
@@ -604,17 +613,17 @@ class Shooter {
 }  // namespace
 
 std::vector<Option> options(ShootRequest& request) {
-  return {{"duration", &request.duration, "S", "of a stretch [s]",
-           "twice the time in which velocities change by their own size; 8 rows at least, half of the longest part of the log at "
-           "most"},
-          {"stretches", &request.most_stretches, "K", "at most so many, evenly taken"},
+  return {{"duration", &request.duration, "S", "duration of a stretch [s]",
+           "twice the time in which velocities change by their own size; at least 8 rows, at most half of the longest part of "
+           "the log"},
+          {"stretches", &request.most_stretches, "K", "maximum number of stretches, evenly spaced"},
           columns_option(request.columns),
           threads_option(request.threads)};
 }
 
-ShootOutcome shoot(const FitFile& fit, const CsvTable& log, const ShootRequest& request) {
+ShootOutcome shoot(const FitFile& fit, const CsvTable& log, const ShootRequest& request, const std::atomic<bool>* stop) {
   require_threads(request.threads);
-  return Shooter(fit, log, request).run();
+  return Shooter(fit, log, request, stop).run();
 }
 
 }  // namespace gp2

@@ -275,9 +275,9 @@ std::string draws_text(const FitReport& report) {
 }  // namespace
 
 std::vector<Option> options(ShowRequest& request) {
-  return {{"latex", &request.latex, "", "as LaTeX"},
-          {"full", &request.full, "", "long expressions too, which otherwise are counted"},
-          {"json", &request.json, "", "as JSON, expressions in full"}};
+  return {{"latex", &request.latex, "", "print as LaTeX"},
+          {"full", &request.full, "", "print long expressions in full instead of their size"},
+          {"json", &request.json, "", "print as JSON, with full expressions"}};
 }
 
 std::string show(const Model& model, const ShowRequest& request) {
@@ -327,7 +327,7 @@ std::string text_of(const FitReport& report, const Model& model) {
   std::string text = "negative log likelihood ";
   text += std::abs(nll) < 1e9 ? fmt::format("{:.6f}\n", nll) : fmt::format("{:.6g}\n", nll);
   text += report.restarts.empty()
-              ? fmt::format("{}: a checkpoint of a fit under way", report.termination)
+              ? fmt::format("{}: a checkpoint of a fit in progress", report.termination)
               : fmt::format("{} after {} iterations ({} restart{}, best: {})", report.termination, report.iterations,
                             report.restarts.size(), report.restarts.size() == 1 ? "" : "s", report.best_restart + 1);
   text += report.seconds > 0 ? fmt::format(", {:.2f} s\n", report.seconds) : "\n";  // no file holds how long it took

@@ -218,14 +218,15 @@ SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, 
 
 std::vector<Option> options(SimulateRequest& request) {
   return {
-      {"rtol", &request.relative_tolerance, "R", "relative error per step, in each of q and dq"},
-      {"atol", &request.absolute_tolerance, "A", "absolute error per step"},
-      {"max_steps", &request.max_steps, "N", "steps at most, accepted and rejected; what they reach is written"},
+      {"rtol", &request.relative_tolerance, "R", "relative error tolerance per step, for q and dq each"},
+      {"atol", &request.absolute_tolerance, "A", "absolute error tolerance per step"},
+      {"max_steps", &request.max_steps, "N", "maximum number of steps, accepted and rejected; rows up to there are written"},
       {"project", Switch{&request.project, "on", "off"}, "",
-       "onto the constraints, after each step and where states are written; off shows how far an integrator drifts"},
-      {"samples", &request.n_samples, "S", "that many functions drawn from the posterior, instead of its mean", "", "n_samples"},
-      {"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"},
-      columns_option(request.columns, "columns by other names, in all logs together"),
+       "project onto the constraints, after each step and at each written state; off: shows the drift of the integrator"},
+      {"samples", &request.n_samples, "S",
+       "number of motions, each under functions sampled from the posterior, instead of one under its mean", "", "n_samples"},
+      {"seed", &request.seed, "K", "random seed of the samples", "", "", "", "samples"},
+      columns_option(request.columns, "columns by other names, in all logs"),
   };
 }
 
@@ -457,8 +458,8 @@ std::vector<std::string> motion_notes(const std::vector<SimulatedMotion>& motion
     }
     if (motion.largest_jump > 0 && !std::exchange(has_jumped, true)) {
       notes.push_back(
-          fmt::format("warning: {} is moved by {:.3g} at once at t = {:.6g}, where a constraint takes hold off its surface: what "
-                      "meets a surface is a contact",
+          fmt::format("warning: {} jumps by {:.3g} at t = {:.6g}, where a constraint becomes active off its surface: write what "
+                      "meets a surface as a contact",
                       called, motion.largest_jump, motion.jump_time));
     }
     if (const LowerRank& lower = motion.lower_rank; !lower.states.empty() && !std::exchange(has_lost_rank, true)) {

@@ -30,13 +30,13 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 std::vector<Option> options(UpdateRequest& request) {
-  return {
-      {"observe", &request.observe, "ddq3,ddq6", "accelerations to learn from", "those that the fit observed"},
-      {"noise_std", &request.noise_stddev, "S", "noise standard deviation of each", "as the log states it, else as in the fit"},
-      columns_option(request.columns),
-      {"forget", &request.forget, "W",
-       "first of all let what was learned count as a share W of it, 0 < W ≤ 1; of fits through inducing points", "1"},
-      {"window", &request.window, "N", "leave the newest N rows; of exact fits", "all"}};
+  return {{"observe", &request.observe, "ddq3,ddq6", "accelerations to learn from", "those that the fit observed"},
+          {"noise_std", &request.noise_stddev, "S", "noise standard deviation of each acceleration",
+           "as the log states it, else as in the fit"},
+          columns_option(request.columns),
+          {"forget", &request.forget, "W",
+           "first multiply the log likelihood of all earlier data by W, 0 < W ≤ 1; for fits with inducing points", "1"},
+          {"window", &request.window, "N", "keep only the N rows added last; for exact fits", "all"}};
 }
 
 namespace {
@@ -48,7 +48,7 @@ Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& 
   const std::vector<std::string> stated = stated_accelerations(names, open_log(fit.model, log, request.columns));
   if (request.noise_stddev) {
     if (!stated.empty()) {
-      notes.push_back(fmt::format("{}: `noise_std={}` stands for the deviations in {}", log.name(), *request.noise_stddev,
+      notes.push_back(fmt::format("{}: `noise_std={}` replaces the standard deviations in {}", log.name(), *request.noise_stddev,
                                   fmt::join(stated, ", ")));
     }
     return Noise(VectorXd::Constant(view.size(), *request.noise_stddev));
@@ -81,17 +81,17 @@ Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& 
       throw InputError(fmt::format("`noise_std`: {} was not observed in the fit; give its noise standard deviation", name));
     } else if (most == 0) {
       throw InputError(
-          fmt::format("`noise_std`: in the fit each value of {} has a noise of its own; give that of these in a column "
-                      "{}_std, or one for all",
+          fmt::format("`noise_std`: each value of {} in the fit has its own noise; give that of the new ones in a column {}_std, "
+                      "or one for all",
                       name, name));
     }
     stddev[k] = most > 0 ? most : 1;
     constexpr double alike = 1.2;
     if (most > alike * least) {
       notes.push_back(
-          fmt::format("warning: {}: the logs of the fit have noises of their own, {} {} {:.3g} to {:.3g}: the largest "
-                      "is taken for these rows; `noise_std` gives another",
-                      log.name(), name, states_noise ? "stated deviations times" : "from", least, most));
+          fmt::format("warning: {}: the logs of the fit differ in noise, {} {} {:.3g} to {:.3g}: the largest is used for these "
+                      "rows; `noise_std` sets another",
+                      log.name(), name, states_noise ? "stated standard deviations times" : "from", least, most));
     }
   }
   if (!stated.empty()) {
@@ -158,11 +158,11 @@ void note_far_rows(const VectorXd& distance, const CsvTable& log, std::vector<st
   if (2 * n_outside <= distance.size()) return;
   const double typical = median({distance.begin(), distance.end()});
   const bool is_other = typical > another_unit;
-  notes.push_back(
-      (is_other ? "warning: " : "") +
-      fmt::format("{}: {} of {} rows are far from the fit's data, half of them {:.2g} times as far or more as those are "
-                  "from each other: whether they agree with it is not known{}",
-                  log.name(), n_outside, distance.size(), typical, is_other ? ". Is the unit of a column another?" : ""));
+  notes.push_back((is_other ? "warning: " : "") +
+                  fmt::format("{}: {} of {} rows are far from the fit's data, half of them {:.2g} or more times as far as those "
+                              "are from each other: whether they agree with it is not known{}",
+                              log.name(), n_outside, distance.size(), typical,
+                              is_other ? ". Does a column have another unit?" : ""));
 }
 
 // How values deviate that are not what the fit predicts; empty where they are.
@@ -181,7 +181,7 @@ std::string offset_text(const std::vector<double>& z) {
   of.rms = std::sqrt(of.rms);
   const bool is_offset = std::abs(mean) > far_mean && std::abs(mean) * std::sqrt(of.n) > surely;
   const bool is_far = of.rms > far_rms && of.is_too_large();
-  return is_offset || is_far ? fmt::format("mean {:.2g}, rms {:.2g} deviations", mean, of.rms) : "";
+  return is_offset || is_far ? fmt::format("mean {:.2g}, rms {:.2g} standard deviations", mean, of.rms) : "";
 }
 
 // Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones.
@@ -234,17 +234,17 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   }
   if (!others.empty()) {
     notes.push_back(fmt::format(
-        "warning: {}: near the fit's data values lie farther from what it predicts than its deviations let them: {}: is a sign, "
-        "a unit, an offset or a column other than in its own logs, or does the machine act otherwise now? Learned from both, "
-        "deviations are too small: `window` or `forget` lets the old rows go; see gp2 evaluate",
+        "warning: {}: near the fit's data, values lie farther from its predictions than its standard deviations explain: {}: "
+        "does a sign, a unit, an offset or a column differ from its own logs, or has the machine changed? Learned from both, "
+        "standard deviations are too small: `window` or `forget` discounts the old rows; see gp2 evaluate",
         log.name(), fmt::join(others, ", ")));
   }
   if (n_wrong > 0) {
-    notes.push_back(fmt::format(
-        "warning: {}: {} of the values cannot be what the fit predicts, up to {:.2g} deviations away ({}): outliers of the log, "
-        "or something acts that the model does not know. They are learned from as all others: leave them out, or fit all "
-        "logs with `robust`",
-        log.name(), n_wrong, worst, where));
+    notes.push_back(
+        fmt::format("warning: {}: {} of the values contradict the fit, up to {:.2g} standard deviations away ({}): outliers of "
+                    "the log, or something acts that is not in the model. They are learned from like all others: leave them out, "
+                    "or fit all logs with `robust`",
+                    log.name(), n_wrong, worst, where));
   }
   if (distance.size() >= fewest_values) note_far_rows(distance, log, notes);
 }
@@ -304,7 +304,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   }
   if (rows.empty()) {
     notes.push_back(
-        fmt::format("warning: {}: nothing is learned from it: no row measures anything where what acts is known", log.name()));
+        fmt::format("warning: {}: nothing is learned from it: no row has a measured value and known acting inputs", log.name()));
   }
   noise = noise.take(rows);
   Observations more{read.states(Eigen::all, rows),
@@ -315,7 +315,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
                     noise.has_scale() ? noise.scale() : MatrixXd()};
   require_usable_noise(posterior, more, log, rows, request.noise_stddev.has_value());
   if (log.file() && fit.has_learned(*log.file())) {
-    notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
+    notes.push_back(fmt::format("warning: {} is already in the fit: its rows count twice", log.name()));
   } else {
     note_shared_rows(groups, {more}, notes);
   }
@@ -344,10 +344,10 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   const double of_more = left_out(all) - before;
   constexpr double much = 1, usual = 3;  // nats; times as much as of as many rows before
   if (of_more > much && of_more > usual * before * n_more / n_before) {
-    notes.push_back(fmt::format(
-        "warning: {}: what the fit's inducing points leave out of its rows is worth about {:.2g} nats: they lie where "
-        "none or few were learned from; a fit of all logs chooses points there too",
-        log.name(), of_more));
+    notes.push_back(
+        fmt::format("warning: {}: the fit's inducing points lose about {:.2g} nats of its rows, which lie far from those learned "
+                    "before; a fit of all logs chooses points there too",
+                    log.name(), of_more));
   }
   return all;
 }

@@ -13,22 +13,21 @@ namespace gp2 {
 /// The directions of a latent with Latent::Base::admissible, one state after the other: with B = diag(s), W = B² and L and T those of
 /// a system whose mass matrix is W⁻¹,
 ///
-///     E = B Π = T B,    dE = −(L dA E + E B dAᵀ Lᵀ B⁻¹)
+///     E = B Π = T B,    dE = T dB − (L dA E + E B dAᵀ Lᵀ B⁻¹), where dB is a multiple of B
 ///
 /// Allocates nothing where the sizes are those of the call before.
 class AdmissibleDirections {
  public:
   using Matrix = Eigen::Ref<const Eigen::MatrixXd>;
 
-  /// @param stddev  s (nq), positive
-  explicit AdmissibleDirections(Eigen::VectorXd stddev)
-      : stddev_(std::move(stddev)), mass_(stddev_.cwiseAbs2().cwiseInverse().asDiagonal()), E_(mass_) {}
-
   /// @param A  (nc × nq)
+  /// @param B  diagonal (nq × nq), positive
   /// @returns E (nq × nq)
   /// @throws NumericalError where W⁻¹ overflows or underflows.
-  const Eigen::MatrixXd& compute(const Matrix& A) {
+  const Eigen::MatrixXd& compute(const Matrix& A, const Matrix& B) {
     if (b_.size() != A.rows()) b_.setZero(A.rows());
+    stddev_ = B.diagonal();
+    mass_ = stddev_.cwiseAbs2().cwiseInverse().asDiagonal();
     projection_.compute(mass_, A, b_);
     if (!projection_.motion_is_determined()) {
       throw NumericalError(fmt::format(
@@ -39,6 +38,9 @@ class AdmissibleDirections {
     E_ = projection_.T() * stddev_.asDiagonal();
     return E_;
   }
+
+  /// T (nq × nq)
+  [[nodiscard]] const Eigen::MatrixXd& projector() const { return projection_.T(); }
 
   /// dE where A, of the call before, changes by dA.
   [[nodiscard]] Eigen::MatrixXd differentiate(const Matrix& dA) const {

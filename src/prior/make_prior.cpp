@@ -85,31 +85,94 @@ class LatentMaker {
     return latents;
   }
 
-  /// Features in units of the lengthscales, directions of the standard deviations: but for one factor nothing is left to tune.
+  /// Features in units of the lengthscales, directions of the standard deviations, both with what they become outside the data: but for
+  /// one factor nothing is left to tune.
   [[nodiscard]] Latent make_discrepancy(const LatentSpec& spec, const Discrepancy& discrepancy) {
     Latent latent;
     const bool has_lengthscales = discrepancy.lengthscale.size() > 0;
-    set_features(spec, latent, has_lengthscales ? &discrepancy.lengthscale : nullptr);
+    std::vector<Expression> features = set_features(spec, latent, &discrepancy.lengthscale);
     latent.name = "discrepancy";
-    latent.kernel = Kernel::parse("se", latent.feature_names);
     latent.kernel_is_fixed = latent.has_one_signal = true;
     latent.base = discrepancy.base;
-    const auto nq = static_cast<std::size_t>(system_->nq());
-    if ((has_lengthscales && discrepancy.lengthscale.size() != latent.n_features()) ||
-        discrepancy.stddev.size() != system_->nq()) {
+    for (const Coordinate& coordinate : system_->coordinates()) latent.column_names.push_back(coordinate.acceleration());
+    const Index nq = system_->nq(), n_ranges = discrepancy.half_range.size();
+    if ((has_lengthscales && discrepancy.lengthscale.size() != latent.n_features()) || discrepancy.stddev.size() != nq) {
       throw InputError(fmt::format("a discrepancy must hold {} lengthscales and {} standard deviations, got {} and {}",
                                    latent.n_features(), nq, discrepancy.lengthscale.size(), discrepancy.stddev.size()));
     }
-    std::vector<Expression> directions(nq * nq, words_.graph.constant(0));
-    for (std::size_t j = 0; j < nq; ++j) {
-      latent.column_names.push_back(system_->coordinates()[j].acceleration());
-      directions[j * nq + j] = words_.graph.constant(discrepancy.stddev[static_cast<Index>(j)]);
+    if (discrepancy.centre.size() != n_ranges || (n_ranges > 0 && discrepancy.lengthscale.size() != n_ranges)) {
+      throw InputError(
+          fmt::format("a discrepancy must hold as many centres and half ranges as lengthscales, {}, or none, got {} and {}",
+                      discrepancy.lengthscale.size(), discrepancy.centre.size(), n_ranges));
+    }
+    const bool is_code = static_cast<bool>(spec.feature_code);
+    const Expression ratio = is_code || n_ranges == 0 ? words_.graph.constant(1) : ratio_to_range(features, discrepancy);
+    if (n_ranges > 0) {
+      latent.feature_names.emplace_back("distance outside the data");
+      latent.is_of_place.push_back(false);
+      if (!is_code) {
+        features.push_back(words_.graph.constant(inverse_lengthscale_outside) * (ratio - words_.graph.constant(1)));
+        latent.features = named(spec, [&] { return ExpressionFunction::of_state(features, words_.symbols, system_); });
+      }
+    }
+    latent.kernel = Kernel::parse("se", latent.feature_names);
+    if (is_code && n_ranges > 0) {
+      set_outside_of_code(spec, discrepancy, latent);
+      return latent;
+    }
+    std::vector<Expression> directions(static_cast<std::size_t>(nq * nq), words_.graph.constant(0));
+    for (Index j = 0; j < nq; ++j) {
+      directions[static_cast<std::size_t>(j * nq + j)] = words_.graph.constant(discrepancy.stddev[j]) * (ratio * ratio);
     }
     latent.directions = ExpressionFunction::of_state_and_parameters(directions, words_.symbols, words_.graph, system_);
     return latent;
   }
 
  private:
+  // ratio to the range from which on a discrepancy grows no more, and how soon it forgets what it is within: as little of that remains
+  // at any ratio ρ > 1 as it grows, ρ² exp(−½ (6 (ρ − 1))²) < 1.06
+  static constexpr double largest_ratio = 4, inverse_lengthscale_outside = 6;
+
+  /// ρ = min(max(1, max_d |φ_d − m_d|/h_d), 4), theory.md T23.
+  /// @param features  in units of the lengthscales
+  [[nodiscard]] Expression ratio_to_range(const std::vector<Expression>& features, const Discrepancy& discrepancy) const {
+    ExpressionGraph& graph = words_.graph;
+    const VectorXd centre = discrepancy.centre.cwiseQuotient(discrepancy.lengthscale);
+    const VectorXd half_range = discrepancy.half_range.cwiseQuotient(discrepancy.lengthscale);
+    Expression ratio = graph.constant(1);
+    for (Index d = 0; d < centre.size(); ++d) {
+      const Expression gap = graph.apply(Operation::abs, features[static_cast<std::size_t>(d)] - graph.constant(centre[d]));
+      ratio = graph.apply(Operation::max, ratio, gap / graph.constant(half_range[d]));
+    }
+    return graph.apply(Operation::min, ratio, graph.constant(largest_ratio));
+  }
+
+  /// The same of features that are code.
+  void set_outside_of_code(const LatentSpec& spec, const Discrepancy& discrepancy, Latent& latent) const {
+    const int nq = system_->nq();
+    const auto ratios = [discrepancy](const MatrixXd& features) -> Eigen::RowVectorXd {
+      const MatrixXd gaps = (discrepancy.lengthscale.asDiagonal() * features).colwise() - discrepancy.centre;
+      const MatrixXd of_range = discrepancy.half_range.cwiseInverse().asDiagonal() * gaps;
+      return of_range.cwiseAbs().colwise().maxCoeff().cwiseMax(1).cwiseMin(largest_ratio);
+    };
+    StateCode features, directions;
+    features.reads = directions.reads = spec.feature_code.reads;
+    features.evaluate = [ratios, of = latent.features](const auto& states, const auto& parameters) -> MatrixXd {
+      const MatrixXd within = of->evaluate(states, parameters);
+      MatrixXd all(within.rows() + 1, within.cols());
+      all << within, inverse_lengthscale_outside * (ratios(within).array() - 1).matrix();
+      return all;
+    };
+    directions.evaluate = [=, of = latent.features](const auto& states, const auto&) -> MatrixXd {
+      return MatrixXd(discrepancy.stddev.asDiagonal()).reshaped() * ratios(of->evaluate(states, VectorXd())).cwiseAbs2();
+    };
+    directions.differentiate = [nq](const auto& states, const auto&, int) -> MatrixXd {
+      return MatrixXd::Zero(nq * nq, states.cols());
+    };
+    latent.features = std::make_shared<CodeFunction>(std::move(features), "discrepancy: features", latent.n_features(), system_);
+    latent.directions = std::make_shared<CodeFunction>(std::move(directions), "discrepancy: directions", nq * nq, system_);
+  }
+
   static void require_potential(const LatentSpec& spec, const Latent& latent) {
     for (std::size_t d = 0; d < latent.feature_names.size(); ++d) {
       if (latent.is_of_place[d]) continue;
@@ -132,8 +195,9 @@ class LatentMaker {
     latent.directions = ExpressionFunction::of_state_and_parameters(entries, words_.symbols, words_.graph, system_);
   }
 
-  /// @param unit  of each feature; null: 1
-  void set_features(const LatentSpec& spec, Latent& latent, const VectorXd* unit = nullptr) {
+  /// @param unit  of each feature, which is not centred; empty: 1; null: 1, and it is centred
+  /// @returns the features, of code none
+  std::vector<Expression> set_features(const LatentSpec& spec, Latent& latent, const VectorXd* unit = nullptr) {
     if (spec.feature_code) {
       latent.feature_names = spec.features;
       StateCode code = spec.feature_code;
@@ -142,7 +206,7 @@ class LatentMaker {
       for (Index d = 0; unit == nullptr && d < centre.size(); ++d)
         centre[d] = centre_of(spec, latent.feature_names[static_cast<std::size_t>(d)]);
       if (unit != nullptr || !centre.isZero(0)) {
-        const VectorXd scale = unit != nullptr ? *unit : VectorXd::Ones(centre.size());
+        const VectorXd scale = unit != nullptr && unit->size() > 0 ? *unit : VectorXd::Ones(centre.size());
         code.evaluate = [of = code.evaluate, centre, scale](const auto& states, const auto& parameters) -> MatrixXd {
           MatrixXd values = of(states, parameters);
           // of another shape it is refused by CodeFunction
@@ -152,7 +216,7 @@ class LatentMaker {
       }
       latent.features = std::make_shared<CodeFunction>(std::move(code), fmt::format("latent '{}': features", spec.name),
                                                        latent.n_features(), system_);
-      return;
+      return {};
     }
     std::vector<Expression> values;
     for (const std::string& feature : spec.features) {
@@ -178,6 +242,7 @@ class LatentMaker {
       values[d] = values[d] / words_.graph.constant((*unit)[static_cast<Index>(d)]);
     }
     latent.features = named(spec, [&] { return ExpressionFunction::of_state(values, words_.symbols, system_); });
+    return values;
   }
 
   // parameters have their values there

@@ -45,11 +45,6 @@ MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, 
   return identity.reshaped().replicate(1, states.cols());
 }
 
-// of a latent with Base::admissible
-AdmissibleDirections admissible_directions(const Ref<const VectorXd>& B, Index nq) {
-  return AdmissibleDirections(Map<const MatrixXd>(B.data(), nq, nq).diagonal());
-}
-
 struct Entry {
   int row, state;
 };
@@ -165,9 +160,9 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
       for (int i = 0; i < n_states; ++i) {
         block(E, i, nq) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(E, i, nq));
       }
-    } else if (latent.base == Latent::Base::admissible && n_states > 0) {
-      AdmissibleDirections directions = admissible_directions(E.col(0), nq);
-      for (int i = 0; i < n_states; ++i) block(E, i, nq) = directions.compute(mechanics.values.A(i));
+    } else if (latent.base == Latent::Base::admissible) {
+      AdmissibleDirections directions;
+      for (int i = 0; i < n_states; ++i) block(E, i, nq) = directions.compute(mechanics.values.A(i), block(E, i, nq));
     }
     values.directions.push_back(std::move(E));
   }
@@ -204,11 +199,11 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
     // E = M⁻¹B: dE = M⁻¹(dB − dM E)
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));
-    } else if (latent.base == Latent::Base::admissible && n_states > 0) {
-      AdmissibleDirections directions =
-          admissible_directions(evaluate_base(latent, states.leftCols(1), parameters, nq, nullptr).col(0), nq);
+    } else if (latent.base == Latent::Base::admissible) {
+      MatrixXd all = evaluate_base(latent, states, parameters, nq, nullptr);
+      AdmissibleDirections directions;
       for (int i = 0; i < n_states; ++i) {
-        directions.compute(mechanics.values.A(i));
+        directions.compute(mechanics.values.A(i), block(all, i, nq));
         block(dE, i, nq) = directions.differentiate(derivative.A(i));
       }
     }

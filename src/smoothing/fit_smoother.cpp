@@ -6,6 +6,7 @@
 
 #include <fmt/format.h>
 
+#include "base/stop.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/smoothing/smoother.hpp"
@@ -194,7 +195,7 @@ Box box_of(const std::vector<Measurement>& measurements, const SmootherModel& ro
 }
 
 /// The maximum of the likelihood near fit.model.
-void maximise(const std::vector<Measurement>& measurements, const Box& box, SmootherFit& fit) {
+void maximise(const std::vector<Measurement>& measurements, const Box& box, const std::atomic<bool>* stop, SmootherFit& fit) {
   const bool with_time = box.upper[4] > box.lower[4];
   const SmootherModel from = fit.model;
   const VectorXd start = logarithms(from.lengthscale, from.signal_stddev, from.noise_stddev, from.velocity_noise_stddev,
@@ -203,6 +204,7 @@ void maximise(const std::vector<Measurement>& measurements, const Box& box, Smoo
                              .cwiseMin(box.upper);
   const auto n = static_cast<double>(measurements.size());
   const auto objective = [&](const VectorXd& x, VectorXd& gradient) {
+    require_not_stopped(stop);
     VectorXd by_logarithm;
     const double value = log_likelihood(of_logarithms(x, from.smoothness), measurements, &by_logarithm);
     gradient = -by_logarithm / n;
@@ -258,7 +260,7 @@ void search(const std::vector<Measurement>& measurements, const Box& box, const 
     SmootherFit one;
     one.model = start;
     one.evaluations = best.evaluations;
-    maximise(some, box, one);
+    maximise(some, box, options.stop, one);
     best.evaluations = one.evaluations;
     if (one.log_likelihood > best.log_likelihood) best = one;
   }
@@ -480,12 +482,13 @@ SmootherFit fit_smoother(std::vector<Measurement> measurements, const SmootherFi
   bool with_time = options.estimate_time_stddev;
   constexpr int max_rounds = 20;
   for (int round = 0; round < max_rounds; ++round) {
+    require_not_stopped(options.stop);
     if (!is_known) {
       const std::vector<Measurement> some = those_used(measurements, trust.used());
       const Box box = box_of(some, rough, most_noise_stddev, options);
       // errors that are gone by the second round have led the first astray
       if (round < 2) search(some, box, rough, options, fit);
-      maximise(some, box, fit);
+      maximise(some, box, options.stop, fit);
     }
     const Hindsight hindsight = hindsight_of(measurements, trust.used(), fit.model);
     fit.kurtosis = kurtosis_of(hindsight.sizes, trust.used());

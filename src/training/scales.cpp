@@ -190,6 +190,7 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
     scales.feature_stddev.push_back(usable_spreads(row_stddev(features), features, prior.latents[a]));
     scales.feature_range.push_back(
         usable_spreads(features.rowwise().maxCoeff() - features.rowwise().minCoeff(), features, prior.latents[a]));
+    scales.feature_centre.emplace_back(features.rowwise().maxCoeff() / 2 + features.rowwise().minCoeff() / 2);
     scales.signal_stddev.push_back(
         signal_scales(prior.latents[a], pooled.directions[a], pooled.mass_diagonal, scales.acceleration_stddev));
     if (prior.latents[a].is_potential) {

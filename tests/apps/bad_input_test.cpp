@@ -54,7 +54,7 @@ const std::vector<BadInput> bad_inputs = {
     {"NextVelocityWithoutATimeStep", nothing, predict_line + " --view next-velocity", {"--view next-velocity", "--dt SECONDS"}},
     {"ATimeStepForAnotherView", nothing, predict_line + " --dt 0.1", {"--dt goes with --view next-velocity"}},
     {"ATimeStepBackwards", nothing, predict_line + " --view next-velocity --dt -1", {"--dt", "must be positive", "-1"}},
-    {"UnknownLatent", nothing, predict_line + " --latent drag", {"--latent", "'drag'", "there is: unconstrained acceleration"}},
+    {"UnknownLatent", nothing, predict_line + " --latent drag", {"--latent", "'drag'", "there are: unconstrained acceleration"}},
     // the model
     {"UnknownSymbol",
      model_with(R"("u2", "u3 - m*g")", R"("ux2", "u3 - m*g")"),

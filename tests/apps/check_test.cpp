@@ -47,7 +47,7 @@ TEST(Check, WarnsOfAccelerationsThatWereComputedFromEachOther) {
               testing::ContainsRegex("warning +dependent columns: the 6 accelerations .* only 2 .* --observe ddq[0-9],ddq[0-9]"));
   const std::string fit = "gp2 fit models/double_pendulum.toml --data log.csv --max-iterations 0 -o fit.json";
   EXPECT_THAT(desk.done(fit).err,
-              HasSubstr("warning: log.csv: the accelerations obey A ddq = b, or a part of it, far better than noise"));
+              HasSubstr("warning: log.csv: the accelerations satisfy A ddq = b, or part of it, far more closely than noise"));
   EXPECT_THAT(desk.done(fit + " --observe ddq3,ddq6").err, Not(HasSubstr("warning")));
 }
 
@@ -96,7 +96,7 @@ TEST(Check, JudgesPriorsByTheirBounds) {
               testing::ContainsRegex("ERROR +parameter 'm': a prior of the logarithm needs bounds above 0, got .0, 2"));
   const Outcome beyond = check_of("[0, 2]", "{ mean = 5, stddev = 0.1 }");
   EXPECT_THAT(beyond.out,
-              testing::ContainsRegex("warning +parameter 'm': the middle of its prior, 5, lies 30 of its deviations"));
+              testing::ContainsRegex("warning +parameter 'm': the centre of its prior, 5, lies 30 standard deviations"));
   EXPECT_THAT(check_of("[0.1, 2]", "{ median = 0.5, log_stddev = 0.1 }").out, Not(HasSubstr("prior")));
   EXPECT_THAT(check_of("[0, 2]", "{ mean = 2.1, stddev = 0.1 }").out, Not(HasSubstr("prior")));
 }
@@ -117,7 +117,7 @@ TEST(Check, WarnsOfAnAngleThatSwingsByHalfTurnsFromRowToRow) {
     return desk.run("gp2 check model.toml --data log.csv").out;
   };
   EXPECT_THAT(check_of(57.3, 0),
-              testing::ContainsRegex("warning +a moves by more than half a turn from row to row, forth and back"));
+              testing::ContainsRegex("warning +a moves by more than half a turn from row to row, back and forth"));
   EXPECT_THAT(check_of(1, 0), Not(HasSubstr("half a turn")));
   EXPECT_THAT(check_of(1, 100), Not(HasSubstr("half a turn")));
   // of an angle that nothing reads, and the log lacks, there is no range
@@ -126,7 +126,7 @@ TEST(Check, WarnsOfAnAngleThatSwingsByHalfTurnsFromRowToRow) {
   desk.write("rates.csv", "t,da,dda\n");
   desk.done("tail -n +2 log.csv | cut -d, -f1,3,4 >> rates.csv");
   EXPECT_THAT(desk.run("gp2 check model.toml --data rates.csv").out,
-              testing::ContainsRegex("forth and back, at [0-9]+ of 99 rows: is it in rad"));
+              testing::ContainsRegex("back and forth, at [0-9]+ of 99 rows: is it in rad"));
 }
 
 TEST(Check, SaysWhichAccelerationsTheLogLacks) {

@@ -117,7 +117,7 @@ TEST_F(FitRaw, GoesFromPositionsToAFit) {
   const Outcome outcome = desk.done(
       fit + "--raw log.csv --max-points 40 --hyperparameters optimise --passes 2 --smoothed smoothed.csv -o fit.json --json");
   EXPECT_TRUE(outcome.said("from the constraints: q1, q2, q4, q5")) << outcome.err;
-  EXPECT_TRUE(outcome.said("what was learned")) << outcome.err;
+  EXPECT_TRUE(outcome.said("the learned dynamics")) << outcome.err;
   EXPECT_TRUE(outcome.said("fit.json: fit of 'double pendulum' to 40 rows")) << outcome.err;
   EXPECT_EQ(desk.table("smoothed.csv").n_rows(), 402);
   EXPECT_GE(desk.table("smoothed.csv").find("ddq6_std"), 0);
@@ -146,7 +146,7 @@ TEST_F(FitRaw, RefusesWhatDoesNotGoTogether) {
     EXPECT_FALSE(desk.has("fit.json"));
     return outcome.err;
   };
-  EXPECT_THAT(refusal("--raw log.csv --data log.csv"), HasSubstr("--raw stands for --data: leave out one of them"));
+  EXPECT_THAT(refusal("--raw log.csv --data log.csv"), HasSubstr("--raw replaces --data: leave out one of them"));
   EXPECT_THAT(refusal("--data log.csv --passes 2"), HasSubstr("--raw"));
   EXPECT_THAT(refusal("--raw log.csv --smoothed log.csv"), HasSubstr("log.csv"));
   EXPECT_THAT(refusal("--raw log.csv --passes -1"), HasSubstr("passes: must not be negative, got -1"));

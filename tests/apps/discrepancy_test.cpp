@@ -71,7 +71,7 @@ TEST_F(DiscrepancyOption, IsALatentThatCanBePredictedAlone) {
   fit("--discrepancy none");
   const Outcome outcome = desk.run("gp2 predict fit.json --states train.csv --latent discrepancy -o no.csv");
   EXPECT_EQ(outcome.status, 2);
-  EXPECT_THAT(outcome.err, HasSubstr("--latent: no latent is called 'discrepancy'; there is: unconstrained acceleration"));
+  EXPECT_THAT(outcome.err, HasSubstr("--latent: no latent is called 'discrepancy'; there are: unconstrained acceleration"));
 }
 
 TEST_F(DiscrepancyOption, StandsUnderEveryPooledSystem) {

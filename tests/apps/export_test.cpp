@@ -154,7 +154,7 @@ TEST_F(RobotExportCommand, LeavesTheRobotAndTheFitAlone) {
   EXPECT_EQ(desk.read("fit.json"), fit);
   const Outcome outcome = desk.run("gp2 export fit.json --to mjcf --view force -o fitted.xml");
   EXPECT_EQ(outcome.status, 2);
-  EXPECT_THAT(outcome.err, HasSubstr("--to mjcf writes parameters, no functions: it goes with --robot and --name alone"));
+  EXPECT_THAT(outcome.err, HasSubstr("--to mjcf writes parameters, not functions: it goes with --robot and --name only"));
   EXPECT_FALSE(desk.has("fitted.xml"));
 }
 

@@ -41,25 +41,24 @@ TEST_F(FitAgain, SaysWhichLogIsNotTheOneThatWasLearnedFrom) {
   EXPECT_THAT(desk.done(again + "--data train.csv --data more.csv").err, Not(HasSubstr("warning")));
   desk.done("cp more.csv copy.csv");
   EXPECT_THAT(desk.done(again + "--data train.csv --data copy.csv").err, Not(HasSubstr("copy.csv is not")));
-  EXPECT_THAT(desk.done(again + "--data train.csv").err,
-              HasSubstr("warning: the fit was learned from more.csv too, which is not given"));
+  EXPECT_THAT(desk.done(again + "--data train.csv").err, HasSubstr("warning: more.csv, a log of the fit, is not given"));
   desk.done("gp2 generate models/surface.toml --n 12 --seed 6 -o more.csv");
   const std::string err = desk.done(again + "--data train.csv --data more.csv --data copy.csv").err;
-  EXPECT_THAT(err, testing::ContainsRegex("warning: more.csv is not as the fit was learned from it: [0-9]+ bytes, 12 rows; then "
-                                          "[0-9]+ bytes, 10 rows"));
+  EXPECT_THAT(err, testing::ContainsRegex(
+                       "warning: more.csv has changed since the fit: now [0-9]+ bytes, 12 rows; then [0-9]+ bytes, 10 rows"));
   desk.done("gp2 generate models/surface.toml --n 12 --seed 7 -o new.csv");
   EXPECT_THAT(desk.done(again + "--data train.csv --data copy.csv --data new.csv").err,
-              HasSubstr("warning: new.csv is not a log that the fit was learned from"));
+              HasSubstr("warning: new.csv is not a log of the fit"));
 
   // a fit, of what it is given twice; an update, of what was learned and what it adds
   EXPECT_THAT(desk.done("gp2 fit models/surface.toml --data more.csv --data copy.csv --max-iterations 0 -o two.json").err,
               Not(HasSubstr("already")));
   EXPECT_THAT(desk.done("gp2 fit models/surface.toml --data copy.csv --data copy.csv --max-iterations 0 -o two.json").err,
-              HasSubstr("warning: copy.csv was learned from already: its rows count twice"));
+              HasSubstr("warning: copy.csv is already in the fit: its rows count twice"));
   EXPECT_THAT(desk.done("gp2 update fit.json --data new.csv -o more.json").err, Not(HasSubstr("already")));
   for (const std::string log : {"new.csv", "copy.csv"}) {
     EXPECT_THAT(desk.done("gp2 update more.json --data " + log + " -o twice.json").err,
-                HasSubstr("warning: " + log + " was learned from already: its rows count twice"));
+                HasSubstr("warning: " + log + " is already in the fit: its rows count twice"));
   }
 }
 
@@ -85,7 +84,7 @@ TEST_F(FitAgain, RobustFitsNeedTheirLog) {
   const Outcome refused = desk.run("gp2 fit --again fit.json -o again.json");
   EXPECT_EQ(refused.status, 2);
   EXPECT_THAT(refused.err,
-              HasSubstr("--again: the data of a robust fit are marked by what it distrusts; give its logs by --data"));
+              HasSubstr("--again: the file of a robust fit has changed noise in its data; give its logs with --data"));
   desk.done("gp2 fit --again fit.json --data train.csv -o again.json");
   EXPECT_EQ(desk.read("again.json"), desk.read("fit.json"));
 }
@@ -98,7 +97,7 @@ TEST_F(FitAgain, RefusesWhatItDoesNotTake) {
     return outcome.err;
   };
   EXPECT_THAT(refusal("models/surface.toml --again fit.json"),
-              HasSubstr("--again: fit.json has its model and options: leave out"));
+              HasSubstr("--again: fit.json contains its model and options: leave out"));
   EXPECT_THAT(refusal("--again fit.json --noise-std 0.1"), HasSubstr("leave out --noise-std"));
   EXPECT_THAT(refusal("--again fit.json --also unconstrained:train.csv"), HasSubstr("--again: --also goes with --data"));
   EXPECT_THAT(refusal("--again absent.json"), HasSubstr("absent.json: cannot be read"));

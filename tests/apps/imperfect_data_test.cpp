@@ -31,7 +31,7 @@ TEST(ImperfectData, EveryCommandCopesWithEmptyCells) {
   EXPECT_THAT(check.out, HasSubstr("ok       1 of 30 values of ddq2 are not measured: their cells are empty"));
   EXPECT_THAT(check.out, HasSubstr("measured ddq on A ddq = b"));
   const Outcome fit = desk.done("gp2 fit models/surface.toml --data log.csv --max-iterations 3 --restarts 1 -o fit.json");
-  EXPECT_TRUE(fit.said("log.csv: values not measured, their cells being empty: 1 of 30 of ddq2"));
+  EXPECT_TRUE(fit.said("log.csv: values not measured (empty cells): 1 of 30 of ddq2"));
   EXPECT_EQ(desk.done("gp2 evaluate fit.json --data log.csv --json").json()["n_missing"], 1);
   EXPECT_THAT(desk.done("gp2 evaluate fit.json --data log.csv").out, HasSubstr("(1 values not measured)"));
   desk.done("gp2 report fit.json --data log.csv -o report.html");

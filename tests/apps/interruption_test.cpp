@@ -94,7 +94,7 @@ TEST_P(Interrupted, AFitSavesTheBestSoFarAndSaysSo) {
   ASSERT_TRUE(WIFEXITED(status)) << "killed by " << WTERMSIG(status);
   EXPECT_EQ(WEXITSTATUS(status), 128 + GetParam());
   EXPECT_THAT(fit.err(), HasSubstr("gp2: interrupted by signal " + std::to_string(GetParam()) + " ("));
-  EXPECT_THAT(fit.err(), HasSubstr("): fit.json holds the best so far, not converged; --start fit.json goes on from there"));
+  EXPECT_THAT(fit.err(), HasSubstr("): fit.json holds the best so far, not converged; --start fit.json continues from there"));
   EXPECT_THAT(desk.read(".stdout"), HasSubstr("interrupted after "));
   const FitFile saved = FitFile::read(desk / "fit.json");
   EXPECT_FALSE(saved.report.converged);
@@ -154,7 +154,7 @@ TEST(InterruptedTwice, AFitSaysWhereItsCheckpointIs) {
   const int status = fit.end();
   // what is under way may be given up before the second signal comes
   if (WIFSIGNALED(status)) {
-    EXPECT_THAT(fit.err(), HasSubstr("gp2: last.json holds the best so far; --start last.json goes on from there\n"));
+    EXPECT_THAT(fit.err(), HasSubstr("gp2: last.json holds the best so far; --start last.json continues from there\n"));
   } else {
     EXPECT_EQ(FitFile::read(desk / "fit.json").report.termination, FitReport::interrupted);
   }

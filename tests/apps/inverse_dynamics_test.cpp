@@ -58,7 +58,7 @@ TEST_F(InverseDynamicsCommand, AnAccelerationOfZeroIsProducedToRounding) {
 
 TEST_F(InverseDynamicsCommand, NamesInputsThatTheAccelerationsLeaveOpen) {
   EXPECT_THAT(desk.done("gp2 predict fit.json --states wanted.csv --inverse-dynamics -o inputs.csv").err,
-              HasSubstr("wanted.csv: the accelerations that are wanted do not determine tau1, tau2 at 8 of 8 rows"));
+              HasSubstr("wanted.csv: the desired accelerations do not determine tau1, tau2 at 8 of 8 rows"));
   desk.done("gp2 generate models/unicycle.toml --n 8 --seed 1 -o log.csv");
   desk.done("gp2 fit models/unicycle.toml --data log.csv --mean force --restarts 1 --max-iterations 5 -o unicycle.json");
   const auto said = [&] { return desk.done("gp2 predict unicycle.json --states log.csv --inverse-dynamics -o inputs.csv").err; };
@@ -128,10 +128,9 @@ TEST_F(InverseDynamicsCommand, RefusesWhatDoesNotGoWithIt) {
     return outcome.err;
   };
   EXPECT_THAT(refusal("--states wanted.csv --view force"),
-              HasSubstr("--inverse-dynamics stands in the place of a view: leave --view, --latent, --dt and --samples out"));
+              HasSubstr("--inverse-dynamics replaces a view: leave out --view, --latent, --dt and --samples"));
   desk.done("cut -d, -f1-6 train.csv | sed 's/dd/x/g' >bare.csv");
-  EXPECT_THAT(refusal("--states bare.csv"),
-              HasSubstr("has none of the columns ddshoulder, ddelbow, the accelerations that are wanted"));
+  EXPECT_THAT(refusal("--states bare.csv"), HasSubstr("has none of the columns ddshoulder, ddelbow, the desired accelerations"));
 }
 
 }  // namespace

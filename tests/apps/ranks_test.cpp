@@ -86,7 +86,7 @@ TEST_F(ManyRanks, WhereOneDiesTheCheckpointIsNamed) {
                            "kill -9 $(cat pid)\nwait $!",
                            GP2_MPIRUN, long_fit));
   EXPECT_NE(outcome.status, 0);
-  EXPECT_THAT(outcome.err, HasSubstr("gp2: last.json holds the best so far; --start last.json goes on from there"));
+  EXPECT_THAT(outcome.err, HasSubstr("gp2: last.json holds the best so far; --start last.json continues from there"));
   EXPECT_FALSE(desk.has("fit.json"));
   desk.done("gp2 predict last.json --states log.csv -o prediction.csv");
 }

@@ -22,7 +22,7 @@ TEST(ResampleCommand, WritesWholeRowsOfTheLogInTheOrderOfChoice) {
   const Desk desk;
   desk.done("gp2 generate models/surface.toml --n 80 -o log.csv");
   const Outcome outcome = desk.done("gp2 resample log.csv --model models/surface.toml -n 30 -o subset.csv");
-  EXPECT_TRUE(outcome.said("measured by q1, q2, q3, dq1, dq2, dq3, u1, u2, u3, each in its standard deviations"));
+  EXPECT_TRUE(outcome.said("distances are in q1, q2, q3, dq1, dq2, dq3, u1, u2, u3, each divided by its standard deviation"));
   EXPECT_TRUE(outcome.said("subset.csv: 30 of 80 rows; every other row is within "));
   EXPECT_EQ(outcome.out, "");
   const std::vector<std::string> log = lines_of(desk.read("log.csv")), subset = lines_of(desk.read("subset.csv"));
@@ -53,7 +53,7 @@ TEST(ResampleCommand, LeavesCellsAsTheyAreAndSkipsGaps) {
              "coordinates = [\"x\"]\n[mechanics]\nmass = [[\"1\"]]\n[[latent]]\nname = \"f\"\nkernel = \"se\"\n"
              "features = [\"x\"]\ndirections = \"acceleration\"\n");
   const Outcome outcome = desk.done("gp2 resample log.csv --model model.toml --map place=x -n 2 -o subset.csv");
-  EXPECT_TRUE(outcome.said("log.csv: 1 rows skipped: no number in some feature"));
+  EXPECT_TRUE(outcome.said("log.csv: 1 rows skipped: a feature has no value"));
   EXPECT_EQ(desk.read("subset.csv"), "t,remark,place\n0,\"a, \"\"b\"\"\",1.50\n2,c,+2e0\n");
 }
 
@@ -86,7 +86,7 @@ TEST(StatedNoiseCommand, FitsEvaluatesAndChecksALogWithDeviations) {
   desk.write("log.csv", csv);
   desk.write("model.toml", replaced(desk.read("models/surface.toml"), "[noise]\nddq = 0.1 ", ""));
   const Outcome fit = desk.done("gp2 fit model.toml --data log.csv --restarts 1 --max-iterations 20 -o fit.json");
-  EXPECT_TRUE(fit.said("log.csv: observes ddq1, ddq2: the log gives the deviations of these alone; others with --observe"));
+  EXPECT_TRUE(fit.said("log.csv: observes ddq1, ddq2: the log has standard deviations of these only; others with --observe"));
   EXPECT_TRUE(fit.said("log.csv: columns not needed: q1_std"));
   EXPECT_EQ(desk.json("fit.json")["observations"][0]["noise_scale"]["ddq2"][0], 0.04);
   const Outcome evaluation = desk.done("gp2 evaluate fit.json --data log.csv --json");
@@ -95,7 +95,7 @@ TEST(StatedNoiseCommand, FitsEvaluatesAndChecksALogWithDeviations) {
   EXPECT_THAT(desk.done("gp2 check model.toml --data log.csv").out,
               HasSubstr("ok       noise of each value: ddq1, ddq2, which a fit observes"));
   EXPECT_TRUE(desk.done("gp2 fit model.toml --data log.csv --noise-std 0.1 --max-iterations 0 -o fit.json")
-                  .said("log.csv: --noise-std 0.1 stands for the deviations in ddq1_std, ddq2_std"));
+                  .said("log.csv: --noise-std 0.1 replaces the standard deviations in ddq1_std, ddq2_std"));
   EXPECT_FALSE(desk.json("fit.json")["observations"][0].contains("noise_scale"));
   desk.done("gp2 fit model.toml --data log.csv --noise-std estimate --restarts 1 --max-iterations 5 -o fit.json");
   EXPECT_NE(desk.read("fit.json").find("stated deviation of ddq1"), std::string::npos);

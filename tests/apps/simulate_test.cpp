@@ -309,7 +309,7 @@ TEST(SimulateRefusals, AMotionThatCannotBeContinuedExitsWith1AndNamesTheTime) {
   EXPECT_EQ(outcome.status, 1);
   EXPECT_THAT(outcome.err, HasSubstr("numerical failure: simulate: the step size fell to"));
   EXPECT_THAT(outcome.err, HasSubstr("at t = 1:"));
-  EXPECT_THAT(outcome.err, HasSubstr("; motion.csv holds what was reached"));
+  EXPECT_THAT(outcome.err, HasSubstr("; motion.csv holds the motion up to there"));
   const CsvTable motion = desk.table("motion.csv");
   ASSERT_GT(motion.n_rows(), 30);
   // x = 1/(1 − t)
@@ -344,7 +344,7 @@ TEST(SimulateModelCommand, EndsAtItsStepsAndWritesWhatTheyReach) {
       desk.run("gp2 simulate models/surface.toml " + figure_start + " --t-end 600 --max-steps 50 --json -o motion.csv");
   EXPECT_EQ(outcome.status, 1);
   EXPECT_THAT(outcome.err, HasSubstr("numerical failure: simulate: 50 steps reach no further than t = "));
-  EXPECT_THAT(outcome.err, HasSubstr("allow more steps (--max-steps); motion.csv holds what was reached"));
+  EXPECT_THAT(outcome.err, HasSubstr("allow more steps (--max-steps); motion.csv holds the motion up to there"));
   EXPECT_EQ(outcome.json()["steps"].get<int>() + outcome.json()["rejected_steps"].get<int>(), 50);
   EXPECT_GE(desk.table("motion.csv").n_rows(), 2);
 }
@@ -411,16 +411,17 @@ TEST(SimulateModelCommand, SaysWhatAConditionDoesThatIsAContact) {
   };
   write(R"({ expr = "z - 0.5*x", when = "x > 1" })");
   const Outcome jump = desk.done("gp2 simulate held.toml --start x=0,z=2,dx=1,dz=0 --t-end 2 --dt 0.1 -o motion.csv");
-  EXPECT_TRUE(jump.said("warning: the motion is moved by 0.")) << jump.err;
-  EXPECT_TRUE(jump.said("where a constraint takes hold off its surface: what meets a surface is a contact")) << jump.err;
+  EXPECT_TRUE(jump.said("warning: the motion jumps by 0.")) << jump.err;
+  EXPECT_TRUE(jump.said("where a constraint becomes active off its surface: write what meets a surface as a contact"))
+      << jump.err;
   const Outcome before = desk.done("gp2 simulate held.toml --start x=0,z=2,dx=1,dz=0 --t-end 0.9 --dt 0.1 -o motion.csv");
-  EXPECT_FALSE(before.said("takes hold")) << before.err;
+  EXPECT_FALSE(before.said("becomes active")) << before.err;
   // a constraint that holds all the time drifts by itself, beside a condition that is never met and one that always is
   for (const char* constraint :
        {R"("x^2 + z^2 - 4", { expr = "z - 9", when = "x > 4000" })", R"({ expr = "x^2 + z^2 - 4", when = "x < 4000" })"}) {
     write(constraint);
     const Outcome drift = desk.done("gp2 simulate held.toml --start x=2,z=0 --t-end 3 --dt 0.1 --rtol 1e-4 -o motion.csv");
-    EXPECT_FALSE(drift.said("takes hold")) << drift.err;
+    EXPECT_FALSE(drift.said("becomes active")) << drift.err;
   }
   write(R"({ expr = "x^2 + z^2 - 1", when = "x^2 + z^2 >= 1" })");
   const Outcome rope = desk.run("gp2 simulate held.toml --start x=0.5,z=0 --t-end 5 --dt 0.2 --max-steps 2000 -o motion.csv");

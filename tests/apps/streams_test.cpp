@@ -166,7 +166,7 @@ TEST_F(Streams, OneStreamIsOneFile) {
   EXPECT_THAT(refusal("gp2 fit models/surface.toml --raw train.csv --smoothed - -o -"),
               HasSubstr("standard output is one file, but - stands for several: name all others"));
   EXPECT_THAT(refusal("gp2 fit models/surface.toml --data - --checkpoint - -o out.json"),
-              HasSubstr("--checkpoint - is written again and again: name a file"));
+              HasSubstr("--checkpoint is rewritten repeatedly: name a file instead of -"));
   EXPECT_THAT(refusal("gp2 export fit.json -o -"), HasSubstr("cannot be made"));
 }
 

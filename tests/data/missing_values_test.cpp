@@ -67,7 +67,7 @@ TEST(MissingValuesFileTest, AnEmptyCellOfAnAccelerationIsNotMeasured) {
   ASSERT_EQ(values.cols(), 12);
   EXPECT_TRUE(std::isnan(values(0, 0)) && std::isnan(values(0, 3)) && std::isnan(values(2, 3)));
   EXPECT_EQ(values.array().isNaN().count(), 3);
-  EXPECT_THAT(problem.notes, Contains("log.csv: values not measured, their cells being empty: 2 of 12 of ddq1, 1 of 12 of ddq3"));
+  EXPECT_THAT(problem.notes, Contains("log.csv: values not measured (empty cells): 2 of 12 of ddq1, 1 of 12 of ddq3"));
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
 }
 
@@ -75,7 +75,7 @@ TEST(MissingValuesFileTest, ARowThatMeasuresNothingIsLeftOutAsIfItWereNotThere) 
   const FitProblem problem = problem_of(gappy_log_of({{"ddq1", 2, ""}, {"ddq2", 2, ""}, {"ddq3", 2, ""}}));
   EXPECT_EQ(problem.observations.front().n_data(), 11);
   EXPECT_THAT(problem.lines.front(), ElementsAre(2, 3, 5, 6, 7, 8, 9, 10, 11, 12, 13)) << "the header is line 1";
-  EXPECT_THAT(problem.notes, Contains("log.csv: 1 rows left out: they measure nothing"));
+  EXPECT_THAT(problem.notes, Contains("log.csv: 1 rows left out: they have no measured value"));
   const FitProblem without = problem_of(gappy_log_of({}).take({0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11}));
   EXPECT_EQ(fit(problem, unoptimised()).report.negative_log_likelihood,
             fit(without, unoptimised()).report.negative_log_likelihood);
@@ -114,8 +114,8 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
   const Observations& group = problem.observations.front();
   EXPECT_TRUE(std::isnan(group.values()(0, 0)) && std::isnan(group.values()(1, 1)) && std::isnan(group.values()(2, 2)));
   EXPECT_EQ(group.noise().scale()(2, 3), 0.08);
-  EXPECT_THAT(problem.notes, Contains("log.csv: values not measured, their cells being empty: 1 of 12 of ddq1, 1 of 12 of ddq2, "
-                                      "1 of 12 of ddq3 (1 for want of a deviation)"));
+  EXPECT_THAT(problem.notes, Contains("log.csv: values not measured (empty cells): 1 of 12 of ddq1, 1 of 12 of ddq2, 1 of 12 of "
+                                      "ddq3 (1 without a standard deviation)"));
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
   for (const char* text : {"0", "-0.1"}) {
     EXPECT_EQ(input_error_of([&] {
@@ -127,7 +127,7 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
   }
   // a column without any deviation is not observed, unless that is asked for
   EXPECT_THAT(problem_of(gappy_log_of({{"ddq1_std", -1, ""}}, stated)).notes,
-              Contains("log.csv: observes ddq2, ddq3: the log gives the deviations of these alone; others with `observe`"));
+              Contains("log.csv: observes ddq2, ddq3: the log has standard deviations of these only; others with `observe`"));
   FitProblemOptions all;
   all.observe = {"ddq1", "ddq2", "ddq3"};
   EXPECT_EQ(input_error_of([&] {
@@ -186,7 +186,7 @@ TEST(MissingValuesFileTest, AKnowledgeMayHaveThemToo) {
   EXPECT_EQ(problem.observations[1].n_data(), 2);
   EXPECT_THAT(problem.lines[1], ElementsAre(2, 4));
   EXPECT_TRUE(std::isnan(problem.observations[1].values()(1, 1)));
-  EXPECT_THAT(problem.notes, Contains("rest.csv: 1 rows left out: they measure nothing"));
+  EXPECT_THAT(problem.notes, Contains("rest.csv: 1 rows left out: they have no measured value"));
 }
 
 TEST(MissingValuesFileTest, ACheckLooksAtTheRowsWhereAllIsMeasured) {

@@ -94,7 +94,7 @@ TEST(StatedNoise, IsThatOfEachValueAndSaysWhatIsObserved) {
   ASSERT_EQ(group.noise().scale().cols(), 40);
   EXPECT_LE((group.noise().scale().row(0).transpose() - stated_deviations()).cwiseAbs().maxCoeff(), 1e-15);
   EXPECT_THAT(problem.notes,
-              ElementsAre("log.csv: observes ddx: the log gives the deviations of these alone; others with `observe`",
+              ElementsAre("log.csv: observes ddx: the log has standard deviations of these only; others with `observe`",
                           "log.csv: the noise of each value is that in ddx_std"))
       << "no warning of accelerations that depend on each other, no column that is not needed";
 }
@@ -103,7 +103,7 @@ TEST(StatedNoise, OfEveryAccelerationLeavesThemAllObserved) {
   const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std", "ddy_std"}), trusting());
   EXPECT_THAT(observed(problem), ElementsAre("ddx", "ddy"));
   EXPECT_THAT(problem.notes, Contains("log.csv: the noise of each value is that in ddx_std, ddy_std"));
-  EXPECT_THAT(problem.notes, Contains(HasSubstr("warning: log.csv: the accelerations obey A ddq = b")));
+  EXPECT_THAT(problem.notes, Contains(HasSubstr("warning: log.csv: the accelerations satisfy A ddq = b")));
 }
 
 TEST(StatedNoise, TheModelsNoiseServesWhereNothingIsStated) {
@@ -127,7 +127,7 @@ TEST(StatedNoise, OneNoiseForAllReplacesIt) {
   EXPECT_THAT(observed(problem), ElementsAre("ddx"));
   EXPECT_FALSE(problem.observations.front().noise().has_scale());
   EXPECT_EQ(problem.observations.front().noise().stddev(), VectorXd::Constant(1, 0.2));
-  EXPECT_THAT(problem.notes, Contains("log.csv: `noise_std=0.2` stands for the deviations in ddx_std"));
+  EXPECT_THAT(problem.notes, Contains("log.csv: `noise_std=0.2` replaces the standard deviations in ddx_std"));
 }
 
 TEST(StatedNoise, IsMultipliedByAFactorThatIsEstimatedUnlessItIsTrusted) {

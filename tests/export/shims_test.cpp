@@ -343,7 +343,7 @@ TEST(ExportJobTest, LeavesDrawsOutThatOthersStandFor) {
   const Posterior posterior = Posterior::mixture(p.prior, p.observations, {p.values, p.values, p.values});
   ExportRequest request;
   request.draws_within = 0.1;
-  EXPECT_THAT(export_fit(fit, posterior, request).notes, testing::ElementsAre("1 of 3 draws stand for all"));
+  EXPECT_THAT(export_fit(fit, posterior, request).notes, testing::ElementsAre("1 of 3 draws represent all"));
 }
 
 }  // namespace

@@ -161,12 +161,11 @@ TEST(CheckOfALoad, SaysWhatTheKnownForceLeavesOutAndFromWhereOnTheContactJams) {
     largest = std::max(largest, std::abs(kappa));
     if (sigma * kappa > 0) jam = std::min(jam, 1 / (sigma * kappa));
   }
-  EXPECT_EQ(
-      finding(rubbing_bead("lambda0")).text,
-      fmt::format("latent 'friction coefficient': where it is 1 it changes lambda0, the load that it reads, by up to {:.2g} "
-                  "of it; lambda is the load with that",
-                  largest));
-  EXPECT_THAT(finding(model).text, testing::HasSubstr(fmt::format("from a coefficient of {:.3g} on it jams", jam)));
+  EXPECT_EQ(finding(rubbing_bead("lambda0")).text,
+            fmt::format("latent 'friction coefficient': a value of 1 changes lambda0, the load that it reads, by up to {:.2g} of "
+                        "it; lambda includes this change",
+                        largest));
+  EXPECT_THAT(finding(model).text, testing::HasSubstr(fmt::format("coefficients of {:.3g} or more make it jam", jam)));
 }
 
 TEST(CheckOfALoad, WarnsOfARowWhoseShareOfItNothingTells) {

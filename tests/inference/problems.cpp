@@ -390,6 +390,12 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     if (m.latents.size() == 1 && m.latents[0].base == Latent::Base::acceleration) {
       PriorOptions options;
       options.discrepancy = Discrepancy{{}, VectorXd::LinSpaced(last + 1, 0.3, 1.7)};
+      const MatrixXd features = evaluate_features(make_prior(m, options), 1, states);
+      options.discrepancy->lengthscale = VectorXd::Ones(features.cols());
+      // most states are outside
+      options.discrepancy->centre = features.colwise().mean().transpose();
+      options.discrepancy->half_range =
+          ((features.rowwise() - features.colwise().mean()).cwiseAbs().colwise().maxCoeff().array() / 3 + 0.1).transpose();
       add(name + ", a discrepancy", m, options, states, {ddq});
     }
     if (m.latents.size() == 1) {

@@ -92,7 +92,7 @@ TEST(CommandRecord, SaysWhatIsLeftOutAndWhatIsTooCoarse) {
   const CsvTable log = late_cart_log(0.02, 0.04, 10, 10, 1);
   const FitProblem problem = make_fit_problem(late_cart(both), log, with_force());
   EXPECT_THAT(problem.notes, Contains("late cart: 3 of 101 rows left out: what acts there depends on commands before the log"));
-  EXPECT_THAT(problem.notes, Contains(HasSubstr("rows are 0.1 s apart as a rule, inputs at most 0.06 s late")));
+  EXPECT_THAT(problem.notes, Contains(HasSubstr("rows are usually 0.1 s apart, inputs at most 0.06 s late")));
 }
 
 TEST(CommandRecord, NeedsTimesInOrderAndRowsLateEnough) {
@@ -110,10 +110,9 @@ TEST(CommandRecord, NeedsTimesInOrderAndRowsLateEnough) {
       error_of(log.take({3, 2})),
       "late cart: u acts late, which takes rows in the order of time, but late cart:4: column 't' has t = 0.02 after 0.03. Sort "
       "the rows, or name what belongs together in a column 'episode'");
-  EXPECT_EQ(
-      error_of(log.first_rows(20)),
-      "late cart: at none of its rows is known what acts: inputs are so late that all depend on commands before the log; give "
-      "the whole log as `commands`, a longer one, or narrower bounds of delays and lags");
+  EXPECT_EQ(error_of(log.first_rows(20)),
+            "late cart: the acting inputs are not known at any row: they all depend on commands before the log; give the whole "
+            "log as `commands`, a longer one, or narrower bounds of delays and lags");
   // where nothing reads u, nothing is needed
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, without_time, {}); }).find("late"), std::string::npos);
 }
@@ -164,7 +163,7 @@ TEST(CommandRecord, OfAFitReachesAsFarAsWhatWasFound) {
   std::vector<int> tenth;
   for (int row = 0; row < log.n_rows(); row += 10) tenth.push_back(row);
   EXPECT_THAT(read_log_states(prior, view, model, log.take(tenth), {}).notes,
-              Contains(HasSubstr("rows are 0.1 s apart as a rule, inputs at most 0.06 s late")));
+              Contains(HasSubstr("rows are usually 0.1 s apart, inputs at most 0.06 s late")));
 }
 
 TEST(CommandRecord, AnotherSystemSharesWhatItMarks) {

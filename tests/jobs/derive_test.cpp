@@ -262,7 +262,7 @@ TEST(Derive, TellsAClockThatIsCoarserThanTheSamplesFromSecondMeasurements) {
   };
   const DerivedData late = derive(cart(), cart_log(ticks));
   EXPECT_THAT(late.notes, Contains(HasSubstr("warning: log.csv: the clock is coarser than the samples: 98 samples have the time "
-                                             "of the one before, and q1 moved on between, by about 0.01 s; log times")));
+                                             "of the one before, although q1 moved in between, by about 0.01 s; log times")));
   EXPECT_EQ(late.series[0].outliers, 0);
   for (Index i = 10; i < 90; ++i)
     EXPECT_NEAR(late.accelerations(0, i), -9 * std::sin(3 * (0.02 * static_cast<double>(i) + 0.005)), 1);
@@ -383,7 +383,7 @@ TEST(Derive, TimesMayCountSmallerUnits) {
       for (std::size_t k = 0; k < rows.size(); ++k) rows[k][0] = shortest(factor * 0.01 * static_cast<double>(k));
     });
     const DerivedData data = derive(cart(), log);
-    EXPECT_THAT(data.notes, Contains(HasSubstr(fmt::format("column 't' is taken to count {}", word))));
+    EXPECT_THAT(data.notes, Contains(HasSubstr(fmt::format("column 't' is assumed to be in {}", word))));
     EXPECT_LE((data.accelerations - seconds.accelerations).cwiseAbs().maxCoeff(), 1e-5);
     EXPECT_NEAR(derive(cart(), log, {.time_unit = TimeUnit::seconds}).states(2, 199), factor * 1.99, 1e-6 * factor);
   }
@@ -522,7 +522,7 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
   EXPECT_THAT(fault(edit([](auto& rows) {
                 for (Row& row : rows) row[1] = "2.5";
               })),
-              HasSubstr("column 'q1': all 200 values are 2.5: nothing moves, which tells neither velocity nor noise"));
+              HasSubstr("column 'q1': all 200 values are 2.5: nothing moves, so there is neither velocity nor noise to find"));
   EXPECT_THAT(fault(edit([](auto& rows) {
                 for (Row& row : rows) row[1] = "nan";
               })),

@@ -359,7 +359,7 @@ TEST(Excitation, SaysWhatIsWrongWithARequest) {
       {[](auto& r) {
          r.inputs_within["push"] = {2, 2};
        },
-       "`inputs_within`: the limits leave no input any room"},
+       "`inputs_within`: all inputs are fixed by their limits"},
       {[](auto& r) {
          r.within["dx"] = {3, -3};
        },
@@ -407,7 +407,7 @@ TEST(Excitation, IsRefusedOfFitsThatKnowNothingToAskFor) {
             "`for=parameters`: the fit estimates no parameters; mark some with estimate = true in the model, or ask "
             "`for=accelerations`");
   EXPECT_EQ(test::input_error_of([&] { excite(bench.model, fit.posterior.without_data(), {}, request); }),
-            "excite: the fit observed no accelerations, so that it does not know with which noise they are measured");
+            "excite: the fit observed no accelerations, so their noise is unknown");
 
   FitRequest of_baseline;
   of_baseline.model = bench.model;
@@ -418,7 +418,7 @@ TEST(Excitation, IsRefusedOfFitsThatKnowNothingToAskFor) {
   of_baseline.max_iterations = 0;
   const FitOutcome baseline = run_fit(prepare_fit(std::move(of_baseline)));
   EXPECT_EQ(test::input_error_of([&] { excite(bench.model, baseline.posterior, baseline.file.report.hyperparameters, request); }),
-            "excite: a baseline knows no constraints, so that it has no motion to plan");
+            "excite: a baseline knows no constraints, so it has no motion to plan");
 }
 
 TEST(Excitation, NeedsSomethingToDriveTheSystemBy) {
@@ -445,7 +445,7 @@ dx = [-1, 1]
   request.start = std::map<std::string, double>{{"x", 0}};
   request.duration = 1;
   EXPECT_EQ(test::input_error_of([&] { excite(free, fit.posterior, fit.file.report.hyperparameters, request); }),
-            "excite: 'weight' has no inputs: there is nothing to drive it by");
+            "excite: 'weight' has no inputs to drive it");
 }
 
 }  // namespace

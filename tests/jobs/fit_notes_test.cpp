@@ -92,7 +92,7 @@ TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {
   const Model plain = constrained_cart("");
   std::string text = plain.text;
   text.replace(text.find("'acceleration'"), 14, "{ force = [['-dx'], ['0']] }");
-  const testing::Matcher<std::vector<std::string>> told = Contains(HasSubstr("directions of the model's latent are not taken"));
+  const testing::Matcher<std::vector<std::string>> told = Contains(HasSubstr("directions of the model's latent are ignored"));
   EXPECT_THAT(make_fit_problem(plain, log, options).notes, testing::Not(told));
   EXPECT_THAT(make_fit_problem(Model::parse(text, "cart"), log, options).notes, told);
   const Model two = Model::parse(plain.text + "[[latent]]\nkernel = 'se'\nfeatures = ['dy']\n", "cart");
@@ -123,7 +123,7 @@ TEST(FitNotes, TellOfALatentThatActsNowhereAndOfLoadsThatAreShared) {
   EXPECT_THAT(sound, Not(HasSubstr("acts at 0")));
   EXPECT_THAT(sound, Not(HasSubstr("follows from others")));
   const std::string idle = told("['y']", "-lambda0(1)");
-  EXPECT_THAT(idle, HasSubstr("warning: latent 'mu' acts at 0 of 3 states: its direction is 0 there"));
+  EXPECT_THAT(idle, HasSubstr("warning: latent 'mu' acts at 0 of 3 states: its direction is 0, and"));
   EXPECT_THAT(idle, HasSubstr("check: latent 'mu' acts at 0 of 3 states"));
   const std::string shared = told("['y', '2*y']", "lambda0(2)");
   EXPECT_THAT(shared, HasSubstr("warning: log.csv: lambda0(2): the constraint '2*y' follows from others"));
@@ -165,7 +165,7 @@ TEST(FitNotes, TellOfRowsThatDryFrictionHolds) {
   };
   const std::string at_rest = "3,3,0,0,0.01,0\n3,3,0,0,-0.02,0\n3,3,0,0,0.01,0\n";
   const auto told = [](const std::string& surface) {
-    const std::string text = "3 of 5 rows are at rest where dry friction jumps, at " + surface + " = 0: what holds";
+    const std::string text = "3 of 5 rows are at rest where dry friction jumps, at " + surface + " = 0: the friction force there";
     return AllOf(Contains(StartsWith("warning: log.csv: " + text)), Contains(StartsWith(text)));
   };
   EXPECT_THAT(notes_and_findings(model_of("sign(dx)"), at_rest), told("dx"));
@@ -282,13 +282,14 @@ TEST(FitNotes, WarnWhereLeftOutRowsDenyTheModel) {
   EXPECT_THAT(note_of(scores_of(0.0222, 0.186, 0.182, 0.92, 201)),
               ElementsAre(StartsWith("rows left out one by one are predicted far worse than the noise: nrmse 0.19")));
   EXPECT_THAT(note_of(scores_of(0.0045, 0.036, 0.036, 0.985, 101)), testing::IsEmpty()) << "sound: friction jumps";
-  EXPECT_THAT(note_of(scores_of(0.0222, 0.604, 0.542, 0.928, 201)), ElementsAre(StartsWith("warning: of stretches of the log")));
-  EXPECT_THAT(
-      note_of(scores_of(0.01, 5000, 37000, 0.31, 201)),
-      ElementsAre(AllOf(StartsWith("warning: of stretches"), HasSubstr("the fit says little, worse than their mean would"))));
+  EXPECT_THAT(note_of(scores_of(0.0222, 0.604, 0.542, 0.928, 201)),
+              ElementsAre(StartsWith("warning: the fit predicts unseen stretches of the log badly")));
+  EXPECT_THAT(note_of(scores_of(0.01, 5000, 37000, 0.31, 201)),
+              ElementsAre(AllOf(StartsWith("warning: the fit predicts unseen stretches"),
+                                HasSubstr("badly, worse than their mean would"))));
   CrossValidation rows = scores_of(0.01, 1.2, 0, 0, 60);
   rows.stretches.reset();
-  EXPECT_THAT(note_of(rows), ElementsAre(StartsWith("warning: of rows left out one by one the fit says little, worse than")));
+  EXPECT_THAT(note_of(rows), ElementsAre(StartsWith("warning: the fit predicts rows left out one by one badly, worse than")));
   rows.residuals.emplace_back().n_far = 1;
   EXPECT_THAT(note_of(rows), testing::IsEmpty()) << "single values are told by themselves";
 }
@@ -324,7 +325,7 @@ TEST(FitNotes, TellWhereResidualsThatLastAreMoreThanNoise) {
   one.output = "ddy";
   one.serial_correlation = 0.75;
   one.rms_in_noise = 1.2;
-  EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("something that lasts longer than a sample")));
+  EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("an effect that lasts longer than a sample")));
   EXPECT_FALSE(last_beyond_noise({one}));
   one.rms_in_noise = 3.9;
   EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("3.9 times the noise: a mass, a length")));

@@ -86,7 +86,7 @@ TEST(InducingFit, TellsWhatIsLeftOutAndItsFileGivesItAgain) {
   const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
   const InducingReport& inducing = outcome.file.report.inducing.value();
   EXPECT_LE(inducing.n_variables, 80);
-  EXPECT_THAT(outcome.notes, Contains(HasSubstr(fmt::format("learned through {} inducing variables", inducing.n_variables))));
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr(fmt::format("learned with {} inducing variables", inducing.n_variables))));
   ASSERT_TRUE(outcome.cross_validation && outcome.cross_validation->stretches);
   EXPECT_NEAR(outcome.cross_validation->one_by_one.coverage95, 0.95, 0.04);
   const test::TemporaryFolder folder;
@@ -163,7 +163,7 @@ TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
   const MatrixXd states = outcome.posterior.observations().front().states().leftCols(50);
   EXPECT_EQ(read.posterior().distance_from_data(view, states), outcome.posterior.distance_from_data(view, states));
   EXPECT_THAT(input_error_of([&] { static_cast<void>(prepare_fit_again(read)); }),
-              HasSubstr("`again`: the file holds what 6000 rows say, and 3000 of them; give its logs by `data`"));
+              HasSubstr("`again`: the file contains sums over 6000 rows, and only 3000 of the rows; give its logs with `data`"));
 }
 
 constexpr const char* bead =

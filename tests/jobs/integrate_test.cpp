@@ -103,7 +103,7 @@ TEST(IntegratedFit, IsRefusedWhereItHasNoMeaning) {
   request = integrating();
   request.max_iterations = 0;
   EXPECT_EQ(test::input_error_of([&] { prepare_fit(request); }),
-            "`hyperparameters=integrate` draws about the optimum: it cannot be with `max_iterations=0`");
+            "`hyperparameters=integrate` samples around the optimum: leave out `max_iterations=0`");
 }
 
 // A bead on a wire whose slope and mass were drawn.

@@ -140,8 +140,7 @@ TEST(PotentialFit, PredictGivesTheEnergyRelativeToTheFirstRow) {
   asked.covariance = PredictRequest::Covariance::full;
   EXPECT_THAT(input_error_of([&] { static_cast<void>(predict(outcome.file, table, asked)); }), HasSubstr("goes with"));
   asked.view.time_step = 0.1;
-  EXPECT_THAT(input_error_of([&] { static_cast<void>(predict(outcome.file, table, asked)); }),
-              HasSubstr("in the place of a view"));
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(predict(outcome.file, table, asked)); }), HasSubstr("replaces a view"));
 }
 
 // A spring that is known, with its potential, and one that is not: their sum is the energy that the learned motion keeps.

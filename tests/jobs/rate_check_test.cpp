@@ -152,7 +152,7 @@ TEST(RateCheck, AnotherColumnIsNamed) {
   const std::vector<std::string> names = {"dx", "dy"};
   EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), HasSubstr("dx: swapped?"));
   rates[0].segment(300, 100).setConstant(not_a_number);
-  EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), HasSubstr("is neither it nor noise"))
+  EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), HasSubstr("is neither this rate nor noise"))
       << "a column with gaps is not offered";
 }
 
@@ -170,7 +170,7 @@ TEST(RateCheck, AColumnThatIsNoRateIsNamedWhateverItIs) {
       copy[i] = exact + normal(random);
     }
     const std::vector<std::string> names = {"dx"};
-    EXPECT_THAT(better_rate({t, "x", value, false, {copy}, names, 0}), HasSubstr("is neither it nor noise")) << noise;
+    EXPECT_THAT(better_rate({t, "x", value, false, {copy}, names, 0}), HasSubstr("is neither this rate nor noise")) << noise;
   }
 }
 

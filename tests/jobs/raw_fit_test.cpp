@@ -105,7 +105,7 @@ TEST(LearnedMotion, WhatIsPredictedWithoutKnowledgeChangesNothing) {
 TEST(LearnedMotion, IsOfTheSamples) {
   const DerivedData plain = derive(pendulum(), noisy_log().table);
   EXPECT_THAT(input_error_of([&] { derive(pendulum(), noisy_log().table, {.every = 2}, true_accelerations(plain)); }),
-              HasSubstr("`rate` and `every` do not go with it"));
+              HasSubstr("leave out `rate` and `every`"));
 }
 
 TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
@@ -127,7 +127,7 @@ TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
   EXPECT_TRUE(once.gains.empty());
   ASSERT_FALSE(turns.gains.empty());
   EXPECT_TRUE(std::is_sorted(turns.gains.begin(), turns.gains.end()));
-  EXPECT_THAT(turns.notes, ElementsAre(HasSubstr("smoothed by what was learned")));
+  EXPECT_THAT(turns.notes, ElementsAre(HasSubstr("times with the learned dynamics")));
   EXPECT_LT(error_of(turns), 0.9 * error_of(once));
   const Score before = score_of(once.data, noisy_log(), *pendulum().system, 0);
   EXPECT_LT(score_of(turns.data, noisy_log(), *pendulum().system, 0).rms[2], 0.5 * before.rms[2]);

@@ -55,7 +55,7 @@ std::vector<std::string> notes_of(const std::vector<std::string>& notes, const s
   return out;
 }
 
-constexpr const char* of_fit = "values lie farther than noise from what all others predict";
+constexpr const char* of_fit = "values differ from their prediction by all others by more than noise";
 constexpr const char* of_constraint = "measured ddq on A ddq = b: rms residual";
 
 TEST(Residuals, OfSoundDataAreNoise) {
@@ -69,7 +69,7 @@ TEST(Residuals, OfSoundDataAreNoise) {
       const std::vector<std::string> notes = notes_of_fit(data);
       EXPECT_THAT(notes, Not(Contains(HasSubstr(of_fit))));
       EXPECT_THAT(notes, Not(Contains(HasSubstr(of_constraint))));
-      EXPECT_THAT(notes, Not(Contains(HasSubstr("residuals go on from row to row"))));
+      EXPECT_THAT(notes, Not(Contains(HasSubstr("residuals are correlated from row to row"))));
     }
   }
 }
@@ -145,11 +145,11 @@ TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
   const LastingErrors log(300, 0.9);
   const FitOutcome all = log.fit(false), fewer = log.fit(true);
   EXPECT_EQ(n_rows(all), 300);
-  EXPECT_THAT(all.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals go on from row to row"),
-                                                 testing::EndsWith(": deviations are too small"))));
+  EXPECT_THAT(all.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals are correlated from row to row"),
+                                                 testing::EndsWith(": standard deviations are too small"))));
   EXPECT_LE(n_rows(fewer), 75);
   EXPECT_GE(n_rows(fewer), 40);
-  EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted to {} of 300, evenly taken", n_rows(fewer)))));
+  EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted to {} of 300, evenly spaced", n_rows(fewer)))));
   EXPECT_LT(log.coverage(all), 0.8);
   EXPECT_GT(log.coverage(fewer), 0.85);
   // the same fit again, from its own file
@@ -164,7 +164,7 @@ TEST(Residuals, ThatDenyAConstraintAreNotThinned) {
   const FitOutcome outcome = log.fit(true);
   EXPECT_EQ(n_rows(outcome), 300);
   EXPECT_THAT(outcome.notes, Contains(HasSubstr(of_constraint)));
-  EXPECT_THAT(outcome.notes, Not(Contains(HasSubstr("evenly taken"))));
+  EXPECT_THAT(outcome.notes, Not(Contains(HasSubstr("evenly spaced"))));
 }
 
 // A sledge of 2 kg on a spring, which its model takes for one of `mass`. Its motion is known, and the force that makes it but for an
@@ -398,8 +398,8 @@ TEST(Residuals, OfForcesAloneHaveFigures) {
 
 TEST(Residuals, TellOfAnInputThatActsOtherwiseThanLogged) {
   const Driven driven;
-  constexpr const char* denied = "the data deny the input";
-  constexpr const char* little = "the fit says little";
+  constexpr const char* denied = "the data contradict the input";
+  constexpr const char* little = "the fit predicts";
   for (const std::uint64_t seed : {31U, 32U}) {
     Data data = driven.data(seed);
     std::vector<std::string> notes = notes_of_fit(data);
@@ -445,7 +445,7 @@ TEST(Residuals, AskInputsThatMakeALoad) {
     data.states.row(data.model->system->layout().u(0)) *= 0.4;
     EXPECT_THAT(
         notes_of(notes_of_fit(data), "input push"),
-        testing::ElementsAre(testing::AllOf(HasSubstr("the data deny"), testing::ContainsRegex("acts (1.[89]|2.[0-9]) "))));
+        testing::ElementsAre(testing::AllOf(HasSubstr("the data contradict"), testing::ContainsRegex("acts (1.[89]|2.[0-9]) "))));
   }
 }
 
@@ -497,7 +497,7 @@ TEST(Residuals, TellOfNoiseThatIsStatedTooLarge) {
     request.problem.mean = Prior::Mean::force;
     request.problem.noise_stddev = noise;
     request.restarts = 1;
-    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "than the noise that is stated");
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "than the stated noise");
   };
   EXPECT_THAT(notes_under(0.05), testing::IsEmpty());
   EXPECT_THAT(notes_under(0.05 * 0.2), testing::IsEmpty());
@@ -650,7 +650,7 @@ TEST(Residuals, NameSingleValuesOfAnInput) {
   data.states(driven.row_of(0), 17) = 1e6;
   EXPECT_THAT(notes_of(notes_of_fit(data), "the input "),
               testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: single values of the input u lie far"),
-                                                  HasSubstr(": 1e+06 at row 18. Mend"))));
+                                                  HasSubstr(": 1e+06 at row 18. Correct them"))));
 }
 
 TEST(Residuals, TellOfRowsThatStandInTwoLogs) {
@@ -661,22 +661,22 @@ TEST(Residuals, TellOfRowsThatStandInTwoLogs) {
     request.model = driven.model;
     request.logs = {{data.table()}, {second.table()}};
     request.max_iterations = 0;
-    return notes_of(prepare_fit(std::move(request)).notes, "stand in another log");
+    return notes_of(prepare_fit(std::move(request)).notes, "are also in another log");
   };
   EXPECT_THAT(notes_with(other), testing::IsEmpty());
   // the second half from its end, as a log of its own
   Data half = data;
   half.states = data.states.rightCols(30).rowwise().reverse();
   half.accelerations = data.accelerations.rightCols(30).rowwise().reverse();
-  EXPECT_THAT(notes_with(half), testing::ElementsAre(testing::StartsWith("warning: 30 of 90 rows stand in another log too")));
+  EXPECT_THAT(notes_with(half), testing::ElementsAre(testing::StartsWith("warning: 30 of 90 rows are also in another log")));
   FitRequest request;
   request.model = driven.model;
   request.logs = {{data.table()}};
   request.max_iterations = 0;
   const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
   EXPECT_THAT(update(outcome.file, {half.table()}, {}).notes,
-              Contains(testing::StartsWith("warning: 30 of 30 rows stand in another log too")));
-  EXPECT_THAT(update(outcome.file, {other.table()}, {}).notes, Not(Contains(HasSubstr("stand in another log"))));
+              Contains(testing::StartsWith("warning: 30 of 30 rows are also in another log")));
+  EXPECT_THAT(update(outcome.file, {other.table()}, {}).notes, Not(Contains(HasSubstr("are also in another log"))));
 }
 
 TEST(Residuals, TellOfAnInputBesideViewsThatHaveNoMean) {
@@ -704,7 +704,7 @@ TEST(Residuals, TellOfAnInputThatNeverMoves) {
   data.states.row(driven.row_of(1)).setZero();
   const std::vector<std::string> notes = notes_of_fit(data);
   EXPECT_THAT(notes_of(notes, "the input w"), testing::ElementsAre("the input w is 0 in every row: was it logged?"));
-  EXPECT_THAT(notes, Contains(HasSubstr("the fit says little")));
+  EXPECT_THAT(notes, Contains(HasSubstr("the fit predicts")));
 }
 
 TEST(Residuals, OfAForceAcrossAConstraintThereAreNone) {
@@ -723,12 +723,12 @@ TEST(Residuals, OfAForceAcrossAConstraintThereAreNone) {
   const FitOutcome outcome = run_fit(prepare_fit(std::move(fit)));
   PredictRequest request;
   request.covariance = PredictRequest::Covariance::stddev;
-  EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data tell little"))));
+  EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data hardly determine"))));
   request.view.quantity = View::Quantity::learned_force;
   EXPECT_THAT(predict(outcome.file, data.table(), request).notes,
-              Contains(testing::AllOf(HasSubstr("the data tell little of force_z ("), Not(HasSubstr("force_y")))));
+              Contains(testing::AllOf(HasSubstr("the data hardly determine force_z ("), Not(HasSubstr("force_y")))));
   request.unconditioned = true;
-  EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data tell little"))));
+  EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data hardly determine"))));
 }
 
 TEST(Residuals, OfPureNoiseAreNotHeldAgainstTheModel) {
@@ -788,7 +788,7 @@ dy = "v*sin(h) + 0.1*dh*cos(h)"
     }
     const Data data = {&model, std::move(drawn.states), std::move(drawn.accelerations)};
     const testing::Matcher<std::vector<std::string>> is_told =
-        Contains(HasSubstr("the constraint alone makes far more than was measured: ddh"));
+        Contains(HasSubstr("the constraint alone causes far more than was measured: ddh"));
     EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero), is_light ? is_told : Not(is_told));
     EXPECT_THAT(notes_of_fit(data, Prior::Mean::force), Not(is_told));
   }

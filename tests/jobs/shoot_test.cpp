@@ -176,15 +176,15 @@ TEST(Shoot, DoubtsALogThatContradictsTheFit) {
   const FitFile fit = fit_of(0);
   const CsvTable log = motion(2e-3, 1);
   EXPECT_THAT(shoot(fit, with_column_off(log, "u", 1.3, 0), {.duration = 1}).notes,
-              Contains(HasSubstr("warning: the motion tells other values than the accelerations did: m, ")));
+              Contains(HasSubstr("warning: the motion gives other values than the accelerations: m, ")));
   EXPECT_THAT(shoot(fit, with_column_off(log, "q", 1, 0.1), {.duration = 1}).notes,
-              Contains(HasSubstr("warning: the motion stays farther off than errors of the log and of the latents let it: q, ")));
+              Contains(HasSubstr("warning: the motion is farther off than errors of the log and of the latents explain: q, ")));
 }
 
 TEST(Shoot, FewStretchesTellNoErrors) {
   const FitFile fit = fit_of(0);
   const CsvTable log = motion(1e-3, 2, 400);
-  const auto told = Contains(HasSubstr("warning: no standard errors: they come from how 4 stretches or more differ"));
+  const auto told = Contains(HasSubstr("warning: no standard errors: they need 4 stretches or more"));
   const ShootOutcome few = shoot(fit, log, {.duration = 0.8, .most_stretches = 3});
   EXPECT_THAT(few.notes, told);
   for (const ShotParameter& one : few.parameters) EXPECT_TRUE(std::isnan(one.stddev)) << one.name;
@@ -336,7 +336,7 @@ TEST(ShootThroughImpacts, NeedsAnImpactInAStretch) {
     static_cast<void>(shoot(fit, log.take(rolls), {.duration = 0.2}));
     FAIL() << "no error";
   } catch (const NumericalError& error) {
-    EXPECT_THAT(error.what(), HasSubstr("the motions do not tell apart: e"));
+    EXPECT_THAT(error.what(), HasSubstr("the motions do not determine separately: e"));
   }
 }
 

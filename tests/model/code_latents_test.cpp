@@ -204,6 +204,12 @@ TEST(CodeLatents, HaveADiscrepancyBesideThem) {
   options.discrepancy = Discrepancy{VectorXd{{0.3, 0.4}}, VectorXd::Constant(2, 0.01)};
   const double text = evaluated_prior(make_prior(text_bead(), options)).value;
   EXPECT_NEAR(evaluated_prior(make_prior(code_bead(), options)).value, text, 1e-12 * std::abs(text));
+  // which grows outside the data
+  options.discrepancy->centre = VectorXd{{0.2, -0.1}};
+  options.discrepancy->half_range = VectorXd{{0.1, 0.5}};
+  const double grown = evaluated_prior(make_prior(text_bead(), options)).value;
+  EXPECT_GT(std::abs(grown - text), 1e-6 * std::abs(text));
+  EXPECT_NEAR(evaluated_prior(make_prior(code_bead(), options)).value, grown, 1e-12 * std::abs(grown));
 }
 
 TEST(CodeLatents, ComeBackFromAFitFileToTheBit) {

@@ -111,7 +111,12 @@ View view_of(const Prior& prior, Quantity quantity, std::optional<int> latent = 
   return view;
 }
 
-MatrixXd some_states(const Model& model) { return test::draw(model, 6, 8).states; }
+// some of them faster than the data
+MatrixXd some_states(const Model& model) {
+  MatrixXd states = test::draw(model, 6, 8).states;
+  states.middleRows(model.system->nq(), model.system->nq()) *= 2;
+  return states;
+}
 
 // ---- which fits have one
 
@@ -136,7 +141,7 @@ TEST(Discrepancy, StandsBesideOneLatentThatActsInEveryDirection) {
   ASSERT_EQ(prior.latents.size(), 2U);
   EXPECT_EQ(prior.latents[0].name, "drag");
   EXPECT_EQ(prior.latents[0].directions, nullptr);
-  EXPECT_EQ(prior.latents[1].feature_names, prior.latents[0].feature_names);
+  EXPECT_THAT(prior.latents[1].feature_names, ElementsAre("x", "dx", "u", "distance outside the data"));
   EXPECT_EQ(view_of(prior, Quantity::unconstrained_acceleration, 1).names(*prior.system, prior.latents[1].name),
             (std::vector<std::string>{"abar_x@discrepancy", "abar_y@discrepancy"}));
 }
@@ -174,7 +179,7 @@ TEST(Discrepancy, StandsBesideSeveralLatentsOfWhichOneActsInEveryDirection) {
     const FitProblem problem = problem_of(model);
     ASSERT_EQ(problem.prior.latents.size(), 3U);
     // of the entries that they read, not of features made of them
-    EXPECT_THAT(problem.prior.latents[2].feature_names, ElementsAre("x", "dx", "u"));
+    EXPECT_THAT(problem.prior.latents[2].feature_names, ElementsAre("x", "dx", "u", "distance outside the data"));
     EXPECT_EQ(problem.prior_options.discrepancy->lengthscale,
               1.25 * default_scales(problem.prior, problem.observations).feature_stddev[0]);
   }
@@ -216,6 +221,51 @@ MatrixXd directions_of(const Prior& prior, const MatrixXd& states, const VectorX
   return values.directions.back().reshaped(prior.system->nq(), prior.system->nq() * states.cols());
 }
 
+/// How many times as far from the middle of the data as their range goes: of the feature of which it is most, from 1 to 4.
+VectorXd ratio_to_range(const FitProblem& problem, const MatrixXd& states) {
+  const Discrepancy& discrepancy = *problem.prior_options.discrepancy;
+  const MatrixXd features = evaluate_features(problem.prior, problem.prior.latents.size() - 1, states).transpose();
+  VectorXd ratio(states.cols());
+  for (Index i = 0; i < ratio.size(); ++i) {
+    const VectorXd phi = features.col(i).head(discrepancy.lengthscale.size()).cwiseProduct(discrepancy.lengthscale);
+    ratio[i] = std::clamp((phi - discrepancy.centre).cwiseQuotient(discrepancy.half_range).lpNorm<Eigen::Infinity>(), 1.0, 4.0);
+  }
+  return ratio;
+}
+
+TEST(Discrepancy, GrowsOutsideTheData) {
+  const Model model = bead();
+  const FitProblem problem = problem_of(model);
+  const Discrepancy& discrepancy = *problem.prior_options.discrepancy;
+  const StateLayout layout = model.system->layout();
+  const MatrixXd& data = problem.observations.front().states();
+  EXPECT_LE((ratio_to_range(problem, data).array() - 1).maxCoeff(), 10 * eps);
+  for (const auto& [feature, entry] : {std::pair(0, layout.q(0)), std::pair(1, layout.dq(0)), std::pair(2, layout.u(0))}) {
+    EXPECT_EQ(discrepancy.centre[feature], data.row(entry).maxCoeff() / 2 + data.row(entry).minCoeff() / 2);
+    EXPECT_NEAR(discrepancy.half_range[feature], (data.row(entry).maxCoeff() - data.row(entry).minCoeff()) / 2, 4 * eps);
+  }
+  // three half ranges from the middle, and so far that it grows no more
+  MatrixXd states = data.leftCols(2);
+  states.row(layout.dq(0)) << discrepancy.centre[1] + 3 * discrepancy.half_range[1], 1e3;
+  const MatrixXd covariance =
+      start_of(problem).without_data().marginal(view_of(problem.prior, Quantity::constrained_acceleration, 1), states).covariance;
+  for (const auto& [state, growth] : {std::pair(0, 9.0), std::pair(1, 16.0)}) {
+    const MatrixXd of_state = covariance.col(state).reshaped(2, 2);
+    const double in_noise = of_state.diagonal().cwiseQuotient(discrepancy.stddev.cwiseAbs2()).sum();
+    EXPECT_NEAR(std::sqrt(in_noise), growth * start, 1e-12 * growth);
+  }
+}
+
+TEST(Discrepancy, OfAFileBeforeItGrewDoesNotGrow) {
+  const Model model = bead();
+  FitProblem problem = problem_of(model);
+  problem.prior_options.discrepancy->centre.resize(0);
+  problem.prior_options.discrepancy->half_range.resize(0);
+  const TemporaryFolder folder;
+  file_of(model, problem).write(folder / "fit.json");
+  EXPECT_EQ(FitFile::read(folder / "fit.json").prior_options.discrepancy->half_range.size(), 0);
+}
+
 TEST(Discrepancy, IsDistributedAsTheNoiseIsGivenThatItObeysTheConstraint) {
   for (const char* name : {"surface", "unicycle", "slider_crank", "double_pendulum", "duffing"}) {
     SCOPED_TRACE(name);
@@ -225,9 +275,10 @@ TEST(Discrepancy, IsDistributedAsTheNoiseIsGivenThatItObeysTheConstraint) {
     const VectorXd parameters = model.system->parameter_values();
     const MechanicsBatch mechanics = require_mechanics(*model.system, states, parameters);
     const MatrixXd all = directions_of(problem.prior, states, parameters);
-    const MatrixXd N = problem.prior_options.discrepancy->stddev.asDiagonal();
-    const Index nq = N.rows();
+    const VectorXd growth = ratio_to_range(problem, states).cwiseAbs2();
+    const Index nq = model.system->nq();
     for (int i = 0; i < states.cols(); ++i) {
+      const MatrixXd N = growth[i] * MatrixXd(problem.prior_options.discrepancy->stddev.asDiagonal());
       const MatrixXd A = mechanics.values.A(i), E = all.middleCols(i * nq, nq), AN = A * N;
       // cov(ε | A ε = 0) of ε ~ N(0, N²)
       const MatrixXd conditional = N * N - N * (AN.completeOrthogonalDecomposition().pseudoInverse() * AN) * N;
@@ -286,11 +337,12 @@ TEST(Discrepancy, FollowsTheParametersOfTheConstraintAndTheState) {
 
 TEST(Discrepancy, OfDeviationsThatHaveNoSquaresIsAnError) {
   const Eigen::RowVector2d A(1, 1);
-  EXPECT_TRUE(AdmissibleDirections(Eigen::Vector2d(1e-100, 1e-99)).compute(A).allFinite());
-  EXPECT_TRUE(AdmissibleDirections(Eigen::Vector2d(1e100, 1e99)).compute(A).allFinite());
-  for (const double size : {1e170, 1e300}) {
-    EXPECT_THROW(AdmissibleDirections(Eigen::Vector2d(size, size)).compute(A), NumericalError);
-  }
+  const auto of = [&](const Eigen::Vector2d& stddev) {
+    return MatrixXd(AdmissibleDirections().compute(A, MatrixXd(stddev.asDiagonal())));
+  };
+  EXPECT_TRUE(of({1e-100, 1e-99}).allFinite());
+  EXPECT_TRUE(of({1e100, 1e99}).allFinite());
+  for (const double size : {1e170, 1e300}) EXPECT_THROW(of({size, size}), NumericalError);
 }
 
 TEST(Discrepancy, HasAUsableDeviationInEveryModel) {
@@ -334,12 +386,14 @@ TEST(Discrepancy, IsASquaredExponentialOfTheseSizes) {
   const MatrixXd covariance = start_of(problem).without_data().joint(alone, states).covariance;
   const StateLayout layout = model.system->layout();
   const std::vector<int> features = {layout.q(0), layout.dq(0), layout.u(0)};
+  const VectorXd ratio = ratio_to_range(problem, states);
+  EXPECT_GT(ratio.maxCoeff(), 1);
   const MatrixXd E = directions_of(problem.prior, states, model.system->parameter_values());
   for (Index i = 0; i < states.cols(); ++i) {
     for (Index k = 0; k < states.cols(); ++k) {
       const VectorXd distance = (states.col(i) - states.col(k))(features).cwiseQuotient(discrepancy.lengthscale);
-      const MatrixXd wanted =
-          start * start * std::exp(-0.5 * distance.squaredNorm()) * E.middleCols(2 * i, 2) * E.middleCols(2 * k, 2).transpose();
+      const MatrixXd wanted = start * start * std::exp(-0.5 * (distance.squaredNorm() + std::pow(6 * (ratio[i] - ratio[k]), 2))) *
+                              E.middleCols(2 * i, 2) * E.middleCols(2 * k, 2).transpose();
       EXPECT_LE((covariance.block(2 * i, 2 * k, 2, 2) - wanted).cwiseAbs().maxCoeff(), 20 * eps);
     }
   }
@@ -589,20 +643,23 @@ TEST(Discrepancy, ThatIsNoneInAFitFileIsRefused) {
   EXPECT_EQ(error_after([](Json& of) { of["lengthscale"].erase(0); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 2 and 2");
   EXPECT_EQ(error_after([](Json& of) { of["lengthscale"] = Json::array(); }),
-            "lengthscale and stddev of the discrepancy must be from 1e-100 to 1e+100");
+            "lengthscale, stddev and half_range of the discrepancy must be from 1e-100 to 1e+100");
   EXPECT_EQ(error_after([](Json& of) { of["stddev"].push_back(1); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 3");
   EXPECT_EQ(error_after([](Json& of) { of["stddev"] = Json::array(); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 0");
-  for (const char* key : {"lengthscale", "stddev"}) {
+  for (const char* key : {"lengthscale", "stddev", "half_range"}) {
     for (const double value : {0.0, -0.1, 1e-320, 1e300}) {
       EXPECT_EQ(error_after([&](Json& of) { of[key][1] = value; }),
-                "lengthscale and stddev of the discrepancy must be from 1e-100 to 1e+100");
+                "lengthscale, stddev and half_range of the discrepancy must be from 1e-100 to 1e+100");
     }
     EXPECT_EQ(error_after([&](Json& of) { of[key][1] = nullptr; }), "null stands where a number must");
     EXPECT_EQ(error_after([&](Json& of) { of[key] = 1; }), "1 stands where an array must");
-    EXPECT_THAT(error_after([&](Json& of) { of.erase(key); }), HasSubstr(key));
   }
+  for (const char* key : {"lengthscale", "stddev", "centre"})
+    EXPECT_THAT(error_after([&](Json& of) { of.erase(key); }), HasSubstr(key));
+  EXPECT_EQ(error_after([](Json& of) { of["centre"].erase(0); }),
+            "a discrepancy must hold as many centres and half ranges as lengthscales, 3, or none, got 2 and 3");
   EXPECT_THAT(error_after([](Json& of) { of = "some"; }), HasSubstr("not a whole fit file"));
 }
 

@@ -291,7 +291,7 @@ TEST(KnownViews, RefuseWhatCannotBeMeant) {
             "`also=unconstrained`: rest.csv has none of the columns abar_x, abar_y; it has: x, dx, u, abar_z");
   SideInformation unknown = at_rest();
   unknown.latent = "lift";
-  EXPECT_EQ(refusal(unknown), "`also=unconstrained`: no latent is called 'lift'; there is: drag");
+  EXPECT_EQ(refusal(unknown), "`also=unconstrained`: no latent is called 'lift'; there are: drag");
   EXPECT_EQ(refusal(at_rest("dx_next", "0"), Quantity::next_velocity), "`also=next-velocity` needs the time step: `dt=SECONDS`");
   options.time_step = -1;
   EXPECT_EQ(refusal(at_rest("dx_next", "0"), Quantity::next_velocity), "`dt`: must be positive, got -1");
@@ -326,7 +326,7 @@ TEST(Knowledge, AloneIsLearntFrom) {
     EXPECT_LE(test::largest(posterior.mean(known.view(), known.states()) - known.values()), 0.1);
   }
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, {}, {}, options); }),
-            "there is nothing to fit: give logs by `data`, or what is known by `also`");
+            "there is nothing to fit: give logs with `data`, or other knowledge with `also`");
 }
 
 // ---- there and back

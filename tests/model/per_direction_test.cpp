@@ -144,7 +144,7 @@ TEST(PerDirection, IsViewedAsOneLatent) {
   const MechanicsBatch mechanics = require_mechanics(*problem.prior.system, states, posterior.values().parameters);
   for (int i = 0; i < 4; ++i) EXPECT_LE((rest.col(i) - mechanics.projections[static_cast<std::size_t>(i)].Lb()).norm(), 1e-13);
   EXPECT_THAT(test::input_error_of([&] { static_cast<void>(latents_called(problem.prior, "g", "`latent`")); }),
-              HasSubstr("no latent is called 'g'; there is: other, f"));
+              HasSubstr("no latent is called 'g'; there are: other, f"));
   view.latent = LatentRange(2, 2);
   EXPECT_THAT(test::input_error_of([&] { static_cast<void>(posterior.marginal(view, states)); }), HasSubstr("got the latent 3"));
 }

@@ -10,9 +10,9 @@ import gp2
 LATE = {"name": "u", "delay": {"estimate": True}, "lag": 0.05}
 
 
-def cart(*inputs):
+def cart(*inputs, mass=1.5):
     return gp2.System(
-        name="cart", coordinates=["x"], inputs=inputs, mass=[[1.5]], force=["u"],
+        name="cart", coordinates=["x"], inputs=inputs, parameters={"m": mass}, mass=[["m"]], force=["u"],
         latents=[{"features": ["dx"], "directions": "force"}], noise=0.05, truth={"force": ["-2*dx - tanh(5*dx)"]})
 
 
@@ -32,10 +32,21 @@ def test_a_delay_is_estimated_and_reported():
     posterior = gp2.fit(cart(LATE), log_of(0.03, 0.05), mean="force", max_points=100, restarts=2, hyperparameters="optimise")
     (estimate,) = posterior.report.actuators
     assert estimate["name"] == "u.delay"
-    assert abs(estimate["value"] - 0.03) < 3 * estimate["stddev"] < 0.01
+    assert abs(estimate["value"] - 0.03) < 3 * estimate["std"] < 0.01
+    assert not estimate["at_bound"] and estimate["moves"] == {}
     text = str(posterior.report)
-    assert re.search(rf"^  u\.delay +{estimate['value']:.6g} ± {estimate['stddev']:.2g} +\[", text, re.MULTILINE)
+    assert re.search(rf"^  u\.delay +{estimate['value']:.6g} ± {estimate['std']:.2g} +\[", text, re.MULTILINE)
     assert text == text.strip() and text in gp2.show(posterior)
+
+
+def test_how_far_the_error_of_a_delay_shifts_a_parameter_is_told(tmp_path):
+    system = cart(LATE, mass={"value": 1.4, "bounds": [1, 2], "estimate": True})
+    posterior = gp2.fit(system, log_of(0.03, 0.05), mean="force", max_points=100, restarts=1, hyperparameters="optimise")
+    (estimate,) = posterior.report.actuators
+    assert list(estimate["moves"]) == ["m"]
+    assert 0 < abs(estimate["moves"]["m"]) < posterior.report.standard_errors["m"]
+    posterior.save(tmp_path / "fit.json")
+    assert gp2.load(tmp_path / "fit.json").report.actuators == [estimate]
 
 
 def test_rows_are_told_by_the_whole_log_what_acts():
@@ -74,6 +85,17 @@ def test_a_fit_again_tells_of_the_delay_that_it_was_given(tmp_path):
     # but for the seconds that it took
     first, second = (open(tmp_path / name).read() for name in ("fit.json", "again.json"))
     assert len(first) == pytest.approx(len(second), abs=40)
+
+
+def test_a_fit_to_rows_is_repeated_with_their_commands(tmp_path):
+    log = log_of(0.03, 0.05)
+    rows = taken(log, np.arange(60, 400, 7))
+    fit = gp2.fit(cart({"name": "u", "delay": 0.03, "lag": 0.05}), rows, commands=log, mean="force", max_iterations=0, thin=False)
+    fit.save(tmp_path / "fit.json")
+    again = gp2.fit_again(tmp_path / "fit.json", rows, commands=log)
+    assert again.negative_log_likelihood == fit.negative_log_likelihood
+    with pytest.raises(gp2.InputError, match="^again: commands goes with data$"):
+        gp2.fit_again(tmp_path / "fit.json", commands=log)
 
 
 def test_a_log_without_times_is_refused():

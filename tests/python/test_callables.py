@@ -1,12 +1,13 @@
 """Systems whose mechanics are Python functions."""
 
+import sys
 import types
 
 import gp2
 import numpy as np
 import pytest
 
-from conftest import MODELS
+from conftest import MODELS, run
 
 SURFACE_KEYS = {
     "coordinates": ["q1", "q2", "q3"],
@@ -148,6 +149,26 @@ def test_several_threads_take_turns_in_the_functions(surface, log):
     options = {"estimate": ["p1"], "restarts": 3, "max_iterations": 5}
     one, two = (gp2.fit(system, log, threads=threads, **options) for threads in (1, 2))
     assert one.report.objective == two.report.objective
+
+
+def test_more_rows_than_a_thread_takes_are_added():
+    """In a process of its own, which can be ended where threads wait for each other."""
+    script = """if True:
+        import numpy as np, gp2
+        x = np.linspace(-1, 1, 900)
+        log = {"x": x, "dx": np.cos(3 * x), "ddx": -1.5 * x}
+        def mechanics(states, parameters):
+            n = len(states)
+            return np.full((n, 1, 1), 2.0), None, None, -3 * states[:, :1]
+        system = gp2.System.from_callables(
+            mechanics, coordinates=["x"], reads=["x", "dx"], latents=[{"features": ["x", "dx"]}], noise=0.1)
+        posterior = gp2.fit(system, {name: values[::20] for name, values in log.items()}, mean="force", max_iterations=0)
+        posterior.update(log)
+        posterior.remove_oldest(45)
+        print(posterior.n_data)
+    """
+    outcome = run(sys.executable, "-c", script)
+    assert (outcome.returncode, outcome.stdout) == (0, "900\n"), outcome.stderr
 
 
 def returning(values):
@@ -299,6 +320,20 @@ def test_functions_of_a_latent_may_be_in_any_mapping():
 
     force = types.MappingProxyType({"force": types.MappingProxyType(CODE["directions"]["force"])})
     assert shown({"features": types.MappingProxyType(CODE["features"]), "directions": force}) == shown(CODE)
+
+
+def test_functions_get_parameters_by_name_where_others_follow_from_them():
+    given = {"half": "m/2", "m": {"value": 2.0, "bounds": [1, 3], "estimate": True}, "twice": "2*m", "h": 0.5}
+    seen = []
+
+    def along(states, values):
+        seen.append(values)
+        return np.ones((len(states), 1, 1))
+
+    force = {"force": {"names": ["along"], "function": along, "reads": []}}
+    system = gp2.System(coordinates=["x"], parameters=given, mass=[["m"]], noise=0.1, latents=[{"features": ["dx"], "directions": force}])
+    gp2.fit(system, {"x": [0.0, 1.0], "dx": [1.0, 0.5], "ddx": [0.1, 0.2]}, estimate=[], max_iterations=0)
+    assert seen[0] == system.parameters == {"m": 2.0, "h": 0.5}
 
 
 @pytest.mark.parametrize("key", ["names", "reads"])

@@ -84,7 +84,7 @@ def test_a_raw_log_is_fitted_to(spring, windows):
         spring, log(noise=1e-2), mean="force", max_points=60, restarts=1, passes=2, windows=windows
     )
     assert len(smoothed) == 400
-    assert any("what was learned" in note for note in report["notes"])
+    assert any("the learned dynamics" in note for note in report["notes"])
     assert report["gains"] == sorted(report["gains"])
     assert abs(posterior.predict(np.array([[0.5, 1.0, 0.0]])).mean[0, 0] + 4.5) < 0.2
     with pytest.raises(gp2.InputError, match="passes: must not be negative"):

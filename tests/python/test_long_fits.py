@@ -7,6 +7,7 @@ import sys
 import textwrap
 import threading
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -93,6 +94,28 @@ def test_ctrl_c_ends_a_simulation():
     assert seconds < PATIENCE
 
 
+def test_ctrl_c_ends_a_search_with_the_best_motion_so_far():
+    out, err, status, seconds = interrupted(
+        """
+        import threading, gp2
+        system = gp2.System(
+            coordinates=["x"], inputs=["u"], mass=[["1"]], force=["u"], latents=[{"features": ["dx"]}], noise=0.1, truth=["0"],
+            sampling={"x": [-1, 1], "dx": [-1, 1], "u": [-1, 1]},
+        )
+        posterior = gp2.fit(system, system.generate(5), mean="force", max_iterations=0)
+        threading.Timer(2, print, ["ready"], {"flush": True}).start()
+        try:
+            gp2.excite(posterior, {"x": 0}, 1, {"u": (-1, 1)}, n_rows=40, n_motions=100_000_000)
+        except KeyboardInterrupt as stop:
+            plan = stop.excitation
+            assert plan.factor < 1 and len(plan.motion.t) == 40
+            print("stopped")
+        """
+    )
+    assert (status, out) == (0, "stopped\n"), err
+    assert seconds < PATIENCE
+
+
 def test_ctrl_c_ends_a_search_that_has_found_no_motion_within_the_limits():
     out, err, status, seconds = interrupted(
         """
@@ -106,6 +129,37 @@ def test_ctrl_c_ends_a_search_that_has_found_no_motion_within_the_limits():
         limits = {"inputs_within": {"u": (-1, 1)}, "within": {"x": (-0.5, 0.5)}}
         try:
             gp2.excite(posterior, {"x": 0, "dx": 50}, 1, **limits, n_rows=40, n_motions=100_000_000)
+        except KeyboardInterrupt:
+            print("stopped")
+        """
+    )
+    assert (status, out) == (0, "stopped\n"), err
+    assert seconds < PATIENCE
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        "posterior.shoot(log, stretches=100_000)",
+        'gp2.derive(system, {"t": t, "x": log["x"], "episode": np.arange(len(t)) // 1000})',
+        "gp2.resample(system, log, 100_000)",
+    ],
+)
+def test_ctrl_c_ends_what_goes_through_a_long_log(work):
+    out, err, status, seconds = interrupted(
+        f"""
+        import threading, numpy as np, gp2
+        system = gp2.System(
+            coordinates=["x"], parameters={{"k": {{"value": 90, "bounds": [50, 200], "estimate": True}}}}, mass=[["1"]], force=["-k*x"],
+            latents=[{{"features": ["x", "dx"]}}], noise=0.1, truth=["0"], sampling={{"x": [-1, 1], "dx": [-10, 10]}},
+        )
+        t = np.arange(200_000) * 1e-3
+        noise = 1e-3 * np.random.default_rng(1).standard_normal(len(t))
+        log = {{"t": t, "x": np.cos(10 * t) + noise, "dx": -10 * np.sin(10 * t)}}
+        posterior = gp2.fit(system, system.generate(30), mean="force", restarts=1, hyperparameters="optimise")
+        threading.Timer(1, print, ["ready"], {{"flush": True}}).start()
+        try:
+            {work}
         except KeyboardInterrupt:
             print("stopped")
         """
@@ -193,6 +247,19 @@ def test_what_progress_raises_ends_the_fit_and_carries_the_best_so_far(long_job,
     assert time.monotonic() - begin < PATIENCE
     mean = caught.value.posterior.predict(surface.generate(4, seed=8)).mean
     assert np.isfinite(mean).all()
+
+
+def test_a_warning_that_is_an_error_carries_the_fit(surface):
+    log = {name: surface.generate(30, seed=1)[name] for name in surface.generate(30, seed=1)}
+    log["ddq1"] = log["ddq1"] + 30 * (np.arange(30) % 10 == 0)  # values far from what all others predict
+    options = dict(restarts=1, max_iterations=3, noise_std=0.1, hyperparameters="optimise", discrepancy=False)
+    with pytest.warns(UserWarning):
+        fitted = gp2.fit(surface, log, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning) as caught:
+            gp2.fit(surface, log, **options)
+    assert caught.value.posterior.report.objective == fitted.report.objective
 
 
 def test_what_is_no_function_is_no_progress(surface, tmp_path):

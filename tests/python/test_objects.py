@@ -27,6 +27,30 @@ def test_what_never_changes_is_its_own_copy_and_a_system_travels_as_text(arm, ar
     assert pickle.loads(pickle.dumps(arm)).text == arm.text
 
 
+def test_tables_survive_a_pickle_with_gaps_and_text():
+    table = gp2.Table({"x": [0.1, np.nan, 1 / 3], "n": [1, None, 3], "said": ["a, b", '"quoted"', " "]}, name="odd")
+    for one in (table, gp2.Table({"x": [np.nan, 5e-324, -1e300]})):
+        again = pickle.loads(pickle.dumps(one))
+        assert (again.name, again.columns, len(again)) == (one.name, one.columns, len(one))
+        np.testing.assert_array_equal(again["x"], one["x"])
+    again = pickle.loads(pickle.dumps(table))
+    np.testing.assert_array_equal(again["n"], table["n"])
+    for one in (table, again):
+        with pytest.raises(gp2.InputError, match="odd:2: column 'said': 'a, b' is not a finite number"):
+            one["said"]
+
+
+def test_logs_and_side_information_survive_a_pickle(arm, arm_log):
+    free = {name: arm_log[name][:3] for name in arm.state_names} | {name: np.zeros(3) for name in ("abar_shoulder", "abar_elbow")}
+    also = gp2.SideInformation("unconstrained", gp2.Table(free), system=arm)
+
+    def fitted(log, also):
+        return gp2.fit(arm, log, also=also, also_noise_std=0.1, max_iterations=0).negative_log_likelihood
+
+    log = gp2.Log(arm_log, arm)
+    assert fitted(*pickle.loads(pickle.dumps((log, also)))) == fitted(log, also)
+
+
 def test_systems_of_one_text_are_equal(arm, posterior):
     again = gp2.System.parse(arm.text, arm.name)
     assert again is not arm and again == arm and len({again, arm}) == 1

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import gp2
-from conftest import ROOT, program
+from conftest import ROOT, program, write_csv
 
 
 def test_pages_and_stub_are_those_of_the_tables():
@@ -134,6 +134,14 @@ def test_what_is_no_mapping_of_numbers_is_a_type_error(arm, arm_log, posterior):
             call()
 
 
+def test_rows_are_drawn_or_on_a_grid(arm):
+    ranges = dict.fromkeys(["shoulder", "delbow", "t", "tau1", "tau2"], 2)
+    assert len(arm.generate(grid=ranges, noise_std=0)) == 2**5
+    for both_or_none in (dict(n=3, grid=ranges), {}):
+        with pytest.raises(gp2.InputError, match="^give either n, a number of rows, or grid$"):
+            arm.generate(**both_or_none)
+
+
 def test_numbers_and_truth_values_of_numpy_go_into_a_model():
     keys = {"coordinates": ["q"], "mass": np.array([["m"]], dtype=object)}
     parameter = {"value": np.float32(0.5), "bounds": np.array([0.25, 1.0]), "estimate": np.True_}
@@ -149,6 +157,11 @@ def test_start_may_be_a_dict(arm, arm_log):
     assert {h.name: h.value for h in again.report.hyperparameters} == values
 
 
+def test_a_file_may_be_a_path(arm, arm_log, tmp_path):
+    gp2.fit(arm, arm_log, restarts=1, max_iterations=2, hyperparameters="optimise", checkpoint=tmp_path / "last.json")
+    assert gp2.load(tmp_path / "last.json").n_data == len(arm_log)
+
+
 def test_a_fit_is_repeated_to_the_bits(arm, arm_log, tmp_path):
     posterior = gp2.fit(arm, arm_log, mean="force", estimate=["m2"], restarts=2, max_iterations=20, seed=4)
     posterior.save(tmp_path / "fit.json")
@@ -157,6 +170,14 @@ def test_a_fit_is_repeated_to_the_bits(arm, arm_log, tmp_path):
     text = (tmp_path / "fit.json").read_text(encoding="utf-8")
     assert (tmp_path / "again.json").read_text(encoding="utf-8") == text
     assert (tmp_path / "from_log.json").read_text(encoding="utf-8") == text
+
+
+def test_a_fit_again_warns_of_a_log_that_has_changed(arm, arm_log, tmp_path):
+    path = write_csv(tmp_path / "log.csv", arm_log)
+    gp2.fit(arm, path, max_iterations=0).save(tmp_path / "fit.json")
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.warns(UserWarning, match="log.csv .*29 rows; then .* 30 rows"):
+        gp2.fit_again(tmp_path / "fit.json", path, checkpoint=tmp_path / "last.json")
 
 
 def test_messages_speak_of_keywords(arm, arm_log, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gp2
-from conftest import columns_of
+from conftest import columns_of, write_csv
 
 
 def assert_on_constraint(system, states, ddq, parameters, tolerance=1e-12):
@@ -165,7 +165,7 @@ def test_a_start_out_of_bounds_is_taken_where_nothing_is_optimised(arm, arm_log,
     start.write_text('{"m2": 2.5}', encoding="utf-8")
     posterior = gp2.fit(arm, arm_log, estimate=["m2"], start=start, max_iterations=0)
     assert posterior.parameters["m2"] == 2.5
-    assert any("m2 = 2.5 is outside its bounds [1, 2]; taken" in note for note in posterior.notes)
+    assert any("m2 = 2.5 is outside its bounds [1, 2]; used" in note for note in posterior.notes)
     with pytest.raises(gp2.InputError, match="m2 = 2.5 is outside its bounds"):
         gp2.fit(arm, arm_log, estimate=["m2"], start=start)
 
@@ -369,6 +369,38 @@ def test_a_motion_that_cannot_start_says_why(start, times, error, text, posterio
     with pytest.raises(error) as caught:
         posterior.simulate(start, times)
     assert text in str(caught.value)
+
+
+def test_a_motion_has_its_energy_where_the_model_has_a_potential(oscillator):
+    spring = gp2.System(coordinates=["x"], mass=[["2"]], force=["-3*x"], potential="1.5*x^2")
+    motion = gp2.simulate(spring, [0.5, 0.3], np.linspace(0, 3, 7))
+    np.testing.assert_allclose(motion.energy, (motion.dq**2 + 1.5 * motion.q**2)[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-5)
+    assert motion.energy_std is None
+    assert gp2.simulate(oscillator, [0.5, 0.3], [0, 1]).energy is None
+
+
+def test_a_motion_starts_where_a_log_does(arm, posterior, tmp_path):
+    log = arm.generate(3, seed=5)
+    first = {name: log[name][0] for name in (*arm.coordinates, "dshoulder", "delbow")}
+    times = log["t"][0] + np.array([0, 0.1])  # the constraint depends on time
+    expected = posterior.simulate(first, times).q
+    for start in (log, log.to_frame(), write_csv(tmp_path / "log.csv", log)):
+        np.testing.assert_allclose(posterior.simulate(start, times).q, expected, rtol=0, atol=1e-9)
+    renamed = log.to_frame().rename(columns={"elbow": "theta2"})
+    moved = posterior.simulate(renamed, times, columns={"elbow": "theta2"})
+    np.testing.assert_allclose(moved.q, expected, rtol=0, atol=1e-9)
+    with pytest.raises(gp2.InputError, match="^start: x alone has none of the columns shoulder"):
+        posterior.simulate(gp2.Table({"x": [1.0]}, name="x alone"), [0, 1])
+
+
+def test_a_report_is_a_mapping_of_hyperparameters(posterior):
+    report = posterior.report
+    assert "m2" in report and "m7" not in report and 3 not in report
+    assert list(report) == [h.name for h in report.hyperparameters]
+    assert {name: report[name] for name in report}["m2"] == posterior.parameters["m2"]
+    with pytest.raises(KeyError, match="no hyperparameter 'm7'; there are: "):
+        report["m7"]
 
 
 def test_a_whole_start_off_the_constraints_is_warned_of(posterior):

@@ -164,6 +164,17 @@ def test_one_observed_acceleration_may_be_flat(data):
     assert np.array_equal(column.predict(X[:4]), mean[:, None])
 
 
+def test_a_series_is_the_acceleration_that_it_is_called(data):
+    X, y = data
+    ddz = pd.DataFrame(y, columns=["ddx", "ddz"])["ddz"]
+    flat = GP2Regressor(WIRE, max_iterations=0).fit(X, ddz)
+    assert flat.outputs_ == ["ddz"]
+    assert np.array_equal(flat.predict(X[:4]), GP2Regressor(WIRE, observe="ddz", max_iterations=0).fit(X, y[:, 1]).predict(X[:4]))
+    assert flat.score(X, ddz) == flat.score(X, y[:, 1])
+    with pytest.raises(gp2.InputError, match="^y: no column ddx; it is ddz$"):
+        GP2Regressor(WIRE, observe="ddx").fit(X, ddz)
+
+
 def test_frames_are_read_by_their_names(data, model):
     X, y = data
     X = pd.DataFrame(X, columns=WIRE.state_names)[["push", "dz", "dx", "z", "x"]]  # t is not read

@@ -1,5 +1,7 @@
 """Logs go by the names of their columns: paths, tables, pandas frames, mappings."""
 
+import logging
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -103,7 +105,7 @@ def test_what_is_known_can_be_learnt_from_alone(arm, frame, arm_states):
     posterior = gp2.fit(arm, [], also=also, also_noise_std=1e-3, max_iterations=0)
     assert posterior.n_data == 1
     assert np.abs(posterior.predict(frame[:1], "unconstrained").mean - [0.5, -0.5]).max() < 0.02
-    with pytest.raises(gp2.InputError, match="there is nothing to fit: give logs by data, or what is known by also"):
+    with pytest.raises(gp2.InputError, match="there is nothing to fit: give logs with data, or other knowledge with also"):
         gp2.fit(arm, [])
 
 
@@ -111,7 +113,7 @@ def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):
     assert len(arm_log) == 30
     assert arm_log.keys() == arm_log.columns == list(arm_log) == list(dict(arm_log))
     assert "elbow" in arm_log
-    assert "wrist" not in arm_log
+    assert "wrist" not in arm_log and 3 not in arm_log
     assert arm_log["elbow"].shape == (30,)
     assert "30 rows of shoulder, elbow" in repr(arm_log)
     with pytest.raises(KeyError, match="no column 'wrist'; it has: shoulder"):
@@ -187,17 +189,21 @@ def test_deviations_in_a_table_are_the_noise_of_its_values(arm, frame, arm_log, 
     got.update(stated.head(1))
     expected.update(frame.head(1))
     np.testing.assert_allclose(got.predict(arm_states).mean, expected.predict(arm_states).mean, rtol=1e-9, atol=1e-9)
-    with pytest.raises(gp2.InputError, match=f"in the fit each value of {names[0]} has a noise of its own"):
+    with pytest.raises(gp2.InputError, match=f"each value of {names[0]} in the fit has its own noise"):
         got.update(frame.head(1))
     got.update(frame.head(1), noise_std=0.2)
 
 
-def test_resampled_rows_are_rows_of_the_table(arm, frame):
+def test_resampled_rows_are_rows_of_the_table(arm, frame, caplog):
     some = gp2.resample(arm, frame, 4)
     assert some.columns == list(frame.columns)
     first = frame.columns[0]
     assert set(some[first]) <= set(frame[first]) and len(some[first]) == 4
     np.testing.assert_array_equal(gp2.resample(arm, frame, 3)[first], some[first][:3])
+    gaps = frame.assign(elbow=np.where(np.arange(len(frame)) < 2, np.nan, frame["elbow"]))
+    with caplog.at_level(logging.INFO, logger="gp2"):
+        assert len(gp2.resample(arm, gaps, 4, features=["elbow"])) == 4
+    assert "data: 2 rows skipped" in caplog.text
     with pytest.raises(gp2.InputError, match="fewer than the n = 1000"):
         gp2.resample(arm, frame, 1000, seed=1, features=[first])
 
@@ -260,6 +266,35 @@ def test_results_are_pandas_frames(arm, arm_log, arm_fit_file, arm_states):
     # a motion is a log, whose deviations are not those of a measurement
     assert list(motion.table.columns) == [c for c in frame.columns if not c.endswith("_std") and c != "distance_from_data"]
     assert list(gp2.simulate(arm, start, [0, 0.1]).to_frame().columns) == motion.table.columns
+
+
+def test_what_is_masked_is_missing_whatever_the_column_holds():
+    for values in ([1.0, 2.0], ["1", "2"], [1, "2"]):
+        masked = np.ma.array(np.array(values, dtype=object if values == [1, "2"] else None), mask=[True, False])
+        np.testing.assert_array_equal(gp2.Table({"x": masked})["x"], [np.nan, 2.0])
+
+
+def test_a_log_of_another_system_may_be_arrays(arm, arm_log, arm_states):
+    heavy = gp2.System.parse(arm.text.replace("# ", "# heavy "), arm.name)
+    arrays = arm.states(arm_log), np.column_stack([arm_log[name] for name in arm.acceleration_names])
+    expected = gp2.fit(arm, [gp2.Log(arm_log, heavy)], max_iterations=0).predict(arm_states)
+    for data in (gp2.Log(arrays, heavy), [gp2.Log(arrays, heavy)]):
+        got = gp2.fit(arm, data, max_iterations=0).predict(arm_states)
+        np.testing.assert_allclose(got.mean, expected.mean, rtol=1e-9, atol=1e-9 * np.abs(expected.mean).max())
+    with pytest.raises(TypeError, match=r"^data\[0\]: expected a gp2.Table"):
+        gp2.fit(arm, [gp2.Log([arm_log], heavy)])
+
+
+def test_columns_of_an_array_have_no_names(arm, arm_log, posterior):
+    states = arm.states(arm_log)
+    accelerations = np.column_stack([arm_log[name] for name in arm.acceleration_names])
+    for call in (
+        lambda **columns: posterior.predict(states, **columns),
+        lambda **columns: posterior.joint(states[:2], **columns),
+        lambda **columns: posterior.inverse_dynamics(states, accelerations, **columns),
+    ):
+        with pytest.raises(gp2.InputError, match="^columns: renames columns of a table, but states are an array"):
+            call(columns={"elbow": "theta2"})
 
 
 class Polars:

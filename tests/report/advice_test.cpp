@@ -58,9 +58,9 @@ ReportData good_data(const std::string& name) {
 
 TEST(Advice, OfAGoodFitIsToTestItOrToLook) {
   Report report = good_report();
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "`data`")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "No problem", "`data`")));
   report.data = {good_data("training"), good_data("test")};
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "pictures")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "No problem", "pictures")));
 }
 
 TEST(Advice, TellsWhereAConstraintLetsGo) {
@@ -104,11 +104,11 @@ TEST(Advice, TellsOfRestartsThatFailedOrDisagree) {
 
 TEST(Advice, SaysWhatTheFitSaid) {
   Report report = good_report();
-  report.notes = {"fitted to 40 of 400, evenly taken",
+  report.notes = {"fitted to 40 of 400, evenly spaced",
                   "warning: p1 ended at its bound, 0.1. It may lie beyond, or the model lacks something"};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "p1 ended at its bound, 0.1.",
                                                            "It may lie beyond, or the model lacks something."),
-                                                   advises(Level::note, "fitted to 40 of 400, evenly taken.", "")));
+                                                   advises(Level::note, "fitted to 40 of 400, evenly spaced.", "")));
   EXPECT_THAT(learning_advice(report)[1].mend, IsEmpty());
   EXPECT_THAT(learning_advice(report)[0].text, Not(HasSubstr("beyond")));
 }
@@ -139,7 +139,7 @@ TEST(Advice, ALengthscaleAtItsUpperBoundIsOnlyAnIrrelevantFeature) {
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "q1 hardly matters", "")));
   report.fit.report.hyperparameters.front().value = 0.05;
   EXPECT_THAT(learning_advice(report),
-              UnorderedElementsAre(advises(Level::note, "short as is allowed: lengthscale(q1) (0.05)", "wiggles"),
+              UnorderedElementsAre(advises(Level::note, "lower bound: lengthscale(q1) (0.05)", "wiggles"),
                                    advises(Level::note, "q1 hardly matters", "")));
 }
 
@@ -196,11 +196,11 @@ TEST(Advice, TellsOfATestThatDeniesAConstraint) {
   Report report = good_report();
   report.data = {good_data("training"), good_data("test")};
   report.data[1].constraint_residuals = {{"z - h*x^2", 50, 9.7, 9.69, 0.2, 10, {3, 4, 5}}};
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning,
-                                                           "The test data deny a constraint: measured ddq on A "
-                                                           "ddq = b: rms residual 9.7 for 'z - h*x^2', mean 9.69, "
-                                                           "expected 0.2 from the noise: 48 ×",
-                                                           "units, signs")));
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning,
+                                  "The test data violate a constraint: measured ddq on A ddq = b: rms residual 9.7 for 'z - "
+                                  "h*x^2', mean 9.69, expected 0.2 from the noise: 48 ×",
+                                  "units, signs")));
   report.data[1].constraint_residuals[0].rms = report.data[1].constraint_residuals[0].mean = 0.21;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
 }
@@ -216,7 +216,7 @@ TEST(Advice, TellsOfOneErrorFarOutAndOfErrorsThatFollowAFeature) {
   test.noise_stddev = Eigen::MatrixXd::Constant(1, n, 0.1);
   test.measured(0, 16) = 1.3;
   EXPECT_THAT(learning_advice(report),
-              ElementsAre(advises(Level::warning, "At row 17 of the test data ddq1 is off by 13 deviations", "")));
+              ElementsAre(advises(Level::warning, "At row 17 of the test data ddq1 is off by 13 standard deviations", "")));
   // a bow over the feature
   const Eigen::VectorXd feature = Eigen::VectorXd::LinSpaced(n, -1, 1);
   test.measured = (0.6 * feature.array().square() - 0.2).transpose();

@@ -227,16 +227,16 @@ TEST_F(ReportOf, SaysWhatTheFitSaidAndOfAFileWithoutNotesWhatItsDataTell) {
   csv.replace(csv.find(cell), cell.size(), "30");
   desk.write("train.csv", csv);
   const std::string said = desk.done("gp2 fit models/surface.toml --data train.csv --restarts 1 --mean force -o fit.json").err;
-  ASSERT_THAT(said, HasSubstr("six deviations or more"));
+  ASSERT_THAT(said, HasSubstr("six or more standard deviations"));
   FitFile file = FitFile::read(desk / "fit.json");
   ASSERT_TRUE(file.notes);
   for (const std::string& note : *file.notes) EXPECT_THAT(said, HasSubstr(with_flags(note)));
-  EXPECT_THAT(desk.done("gp2 show fit.json").out, HasSubstr("six deviations or more"));
+  EXPECT_THAT(desk.done("gp2 show fit.json").out, HasSubstr("six or more standard deviations"));
   std::vector<std::string> notes;
   const Posterior posterior = file.posterior();
   EXPECT_EQ(collect_report(file, posterior, {}, notes).notes, *file.notes);
   file.notes.reset();
-  EXPECT_THAT(collect_report(file, posterior, {}, notes).notes, testing::Contains(HasSubstr("six deviations or more")));
+  EXPECT_THAT(collect_report(file, posterior, {}, notes).notes, testing::Contains(HasSubstr("six or more standard deviations")));
   desk.done("gp2 update fit.json --data sound.csv -o more.json");
   EXPECT_FALSE(FitFile::read(desk / "more.json").notes) << "they are of the data that there were";
 }

@@ -410,7 +410,7 @@ TEST_F(RobotExport, IncludedFilesStayWhereTheyAre) {
   with.insert(with.find("  <worldbody>"), "  <include file=\"tool.xml\"/>\n");
   make(with);
   const ExportOutcome out = outcome();
-  EXPECT_THAT(out.notes, ElementsAre(HasSubstr("the file names others: it belongs into the folder of ")));
+  EXPECT_THAT(out.notes, ElementsAre(HasSubstr("the file refers to others: put it into the folder of ")));
   EXPECT_THAT(out.files[0].second, HasSubstr("  <include file=\"tool.xml\"/>\n"));
 }
 
@@ -423,14 +423,14 @@ TEST_F(RobotExport, WhatIsNoBodyIsWrittenWithAWarning) {
 TEST_F(RobotExport, WhatDoesNotGoTogetherIsRefused) {
   make();
   request_.single_precision = true;
-  EXPECT_EQ(error(), "`to=mjcf` writes parameters, no functions: it goes with `robot` and `name` alone");
+  EXPECT_EQ(error(), "`to=mjcf` writes parameters, not functions: it goes with `robot` and `name` only");
   request_ = ExportRequest();
   request_.to = ExportRequest::Target::mjcf;
   std::string without = model_text;
   without.erase(without.find("d = "), without.find("g = ") - without.find("d = "));
   make(robot_text, without);
   fit_.report.hyperparameters.clear();
-  EXPECT_THAT(error(), HasSubstr("`to=mjcf`: the model has no number of its robot as a parameter that differs"));
+  EXPECT_THAT(error(), HasSubstr("`to=mjcf`: no parameter of the model changes a number of its robot"));
   fit_.model.robot.reset();
   EXPECT_EQ(error(), "`to=mjcf` writes into the file of a robot, but the model has none");
 }
@@ -448,7 +448,7 @@ d = { of = "damping('b')", value = 0.3 }
   fit_.report.uncertainty->stddev = Eigen::VectorXd::Constant(1, 0.02);
   fit_.report.hyperparameters = {hyperparameter("m", 0, 1, 3, 1.7)};
   request_.to = ExportRequest::Target::mjcf;
-  EXPECT_THAT(error(), EndsWith("robot.urdf' is a file of the other format, and is written into by `to=urdf`"));
+  EXPECT_THAT(error(), EndsWith("robot.urdf' is a file of the other format; use `to=urdf`"));
   request_.to = ExportRequest::Target::urdf;
   const ExportOutcome out = outcome();
   EXPECT_THAT(out.notes, IsEmpty());
@@ -460,7 +460,7 @@ d = { of = "damping('b')", value = 0.3 }
   EXPECT_THAT(out.files[0].second, HasSubstr("<!-- fitted: mass = 1.7 (standard error 0.02) -->"));
   make();
   request_.to = ExportRequest::Target::urdf;
-  EXPECT_THAT(error(), EndsWith("robot.xml' is a file of the other format, and is written into by `to=mjcf`"));
+  EXPECT_THAT(error(), EndsWith("robot.xml' is a file of the other format; use `to=mjcf`"));
 }
 
 }  // namespace

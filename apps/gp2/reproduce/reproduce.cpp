@@ -90,19 +90,18 @@ Command reproduce_command() {
   for (const Experiment& experiment : experiments) names.emplace_back(experiment.name, experiment.name);
   Option what{"what", choice(a->what, names), "", "which"};
   what.flag = "WHAT";
-  return {
-      "reproduce",
-      "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
-      "gp2 reproduce table1 --runs 2 -o results",
-      {required(std::move(what)),
-       {"protocol", choice(a->protocol, {{"paper", "paper"}, {"default", "default"}, {"both", "both"}}), "",
-        "how GP² is trained: paper, default, or both; the other methods are the same under each"},
-       {"data", &a->data, "DIR", "folder of the published observations; without it they are drawn from the same distributions"},
-       {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
-       threads_option(a->threads),
-       {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
-       output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)")},
-      [a](const std::set<std::string>&) { run(*a); }};
+  return {"reproduce",
+          "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
+          "gp2 reproduce table1 --runs 2 -o results",
+          {required(std::move(what)),
+           {"protocol", choice(a->protocol, {{"paper", "paper"}, {"default", "default"}, {"both", "both"}}), "",
+            "training of GP²; the other methods are the same in both"},
+           {"data", &a->data, "DIR", "folder of the published observations; default: drawn from the same distributions"},
+           {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
+           threads_option(a->threads),
+           {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
+           output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)")},
+          [a](const std::set<std::string>&) { run(*a); }};
 }
 
 }  // namespace gp2::command

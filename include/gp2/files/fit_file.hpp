@@ -31,11 +31,11 @@ struct FitFile {
   ///   hyperparameters of another posterior.
   FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
 
-  /// 11: a discrepancy that the constraint admits, centres of features, the logs; 10: what many observations say, in their place; 9:
-  /// inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5:
-  /// robots; 4: values with a noise of their own; 3: mechanics that are code; 2: observations of other systems. All of them are read;
-  /// 11 is written.
-  static constexpr int format_version = 11;
+  /// 12: a discrepancy that grows outside the data; 11: a discrepancy that the constraint admits, centres of features, the logs; 10:
+  /// what many observations say, in their place; 9: inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a checksum
+  /// and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2:
+  /// observations of other systems. All of them are read; 12 is written.
+  static constexpr int format_version = 12;
 
   Model model;
   FitPriorOptions prior_options;

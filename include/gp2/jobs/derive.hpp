@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <functional>
 #include <map>
 #include <optional>
@@ -34,6 +35,7 @@ struct DeriveOptions {
   bool keep_positions = false;                         // in each series, as they were taken
   int n_threads = 0;                                   // 0: all cores; the numbers do not depend on it
   std::function<void(double fraction)> progress = {};  // of the work done; called from worker threads, one at a time
+  const std::atomic<bool>* stop = nullptr;             // set: ends before long, by throwing
 };
 
 std::vector<Option> options(DeriveOptions& options);
@@ -97,7 +99,7 @@ struct DerivedData {
 ///
 /// @throws InputError naming the log, episode, column and row: no time, no coordinate, time that runs backwards, too few
 ///   samples, a column that never moves, an unknown episode or column, coordinates that the log leaves open.
-/// @throws NumericalError when Newton's method does not reach the constraints.
+/// @throws NumericalError when Newton's method does not reach the constraints, and when stopped.
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options = {});
 
 /// The accelerations that a fit predicts at the rows of a derive with rate 0 and every 1 (nq × N each).

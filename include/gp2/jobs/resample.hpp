@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 #include <map>
 #include <optional>
@@ -26,7 +27,10 @@ struct FarthestPoints {
 /// @param points  (D × N)
 /// @param n       1 … N
 /// @param first   the column to start with
-FarthestPoints farthest_points(const Eigen::Ref<const Eigen::MatrixXd>& points, int n, int first);
+/// @param stop    set: ends before long, by throwing
+/// @throws NumericalError when stopped.
+FarthestPoints farthest_points(const Eigen::Ref<const Eigen::MatrixXd>& points, int n, int first,
+                               const std::atomic<bool>* stop = nullptr);
 
 struct ResampleOptions {
   int n = 0;
@@ -49,9 +53,11 @@ struct Resample {
 /// n rows of a log that cover it best: farthest points in the space of the model's features, each divided by its standard
 /// deviation over the log. A feature that does not vary counts for nothing.
 ///
+/// @param stop  as of farthest_points
 /// @throws InputError when n is not positive or exceeds the rows that have every feature, for an unknown symbol, a missing
-/// column,
-///   or cells that are neither numbers nor empty.
-Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options);
+///   column, or cells that are neither numbers nor empty.
+/// @throws NumericalError when stopped.
+Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options,
+                  const std::atomic<bool>* stop = nullptr);
 
 }  // namespace gp2

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <map>
 #include <optional>
 #include <string>
@@ -52,8 +53,10 @@ struct ShootOutcome {
 ///
 /// @param log  t, all coordinates and velocities, inputs; stretches end where time does not go on, where rows are missing and
 ///   where its column `episode` changes. Compared are the coordinates with a NAME_std column, or all where there is none.
+/// @param stop  set: ends before long, by throwing
 /// @throws InputError when the fit estimates no parameter of the system, the log lacks a column, or no stretch fits in it.
-/// @throws NumericalError when no motion can be followed, or the motions do not tell the parameters apart.
-ShootOutcome shoot(const FitFile& fit, const CsvTable& log, const ShootRequest& request = {});
+/// @throws NumericalError when no motion can be followed, or the motions do not tell the parameters apart, and when stopped.
+ShootOutcome shoot(const FitFile& fit, const CsvTable& log, const ShootRequest& request = {},
+                   const std::atomic<bool>* stop = nullptr);
 
 }  // namespace gp2

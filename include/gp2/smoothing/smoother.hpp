@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <optional>
 #include <string>
 #include <vector>
@@ -76,6 +77,7 @@ struct SmootherFitOptions {
   /// Also estimates τ: the faster a joint, the more a sample suffers from being taken a little early or late. Not where the motion
   /// stands out of the noise up to half the Nyquist frequency: its fast places, where τ is felt, would pass for noise.
   bool estimate_time_stddev = true;
+  const std::atomic<bool>* stop = nullptr;  // set: ends before long, by throwing
 };
 
 /// A model and what it was told.
@@ -93,6 +95,7 @@ struct SmootherFit {
 /// Lengthscale, size and noise of a motion by maximum likelihood, without the measurements that the others contradict. The
 /// farthest of its neighbourhood is taken away first, the model fitted anew, and a measurement taken back that agrees after all.
 /// @throws InputError as log_likelihood, for fewer than 5 positions, and when all positions are the same.
+/// @throws NumericalError when stopped.
 SmootherFit fit_smoother(std::vector<Measurement> measurements, const SmootherFitOptions& options = {});
 
 /// The step of an encoder: of whole multiples of it 95 of 100 values are off the one that is there most often; 0 where there is

@@ -43,6 +43,7 @@ struct Scales {
   std::vector<Eigen::VectorXd> feature_mean;    // per latent (D)
   std::vector<Eigen::VectorXd> feature_stddev;  // per latent (D)
   std::vector<Eigen::VectorXd> feature_range;   // per latent (D), largest minus smallest
+  std::vector<Eigen::VectorXd> feature_centre;  // per latent (D), in the middle between them
   std::vector<Eigen::VectorXd> signal_stddev;  // per latent (p): σ_j, M_jj σ_j, or σ̄ / rms(E column); of a potential all alike
   std::vector<Eigen::VectorXd> output_stddev;  // per Observations (d)
   Eigen::VectorXd acceleration_stddev;         // σ (nq)
