@@ -38,7 +38,7 @@ TEST(ResampleCommand, MeasuresByTheFeaturesAskedForFromTheSeedGiven) {
   const Desk desk;
   desk.done("gp2 generate models/surface.toml --n 80 -o log.csv");
   const std::string line = "gp2 resample log.csv --model models/surface.toml -n 10 ";
-  EXPECT_TRUE(desk.done(line + "--features 'atan2(q1, q2), dq1' -o a.csv").said("measured by atan2(q1, q2), dq1, each"));
+  EXPECT_TRUE(desk.done(line + "--features 'atan2(q1, q2), dq1' -o a.csv").said("distances are in atan2(q1, q2), dq1, each"));
   desk.done(line + "--seed 1 -o b.csv");
   desk.done(line + "--seed 2 -o c.csv");
   desk.done(line + "--seed 2 -o d.csv");
