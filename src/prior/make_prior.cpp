@@ -106,12 +106,13 @@ class LatentMaker {
                       discrepancy.lengthscale.size(), discrepancy.centre.size(), n_ranges));
     }
     const bool is_code = static_cast<bool>(spec.feature_code);
-    const Expression ratio = is_code || n_ranges == 0 ? words_.graph.constant(1) : ratio_to_range(features, discrepancy);
+    const Expression growth = is_code || n_ranges == 0 ? words_.graph.constant(1) : growth_of(features, discrepancy);
     if (n_ranges > 0) {
       latent.feature_names.emplace_back("distance outside the data");
       latent.is_of_place.push_back(false);
       if (!is_code) {
-        features.push_back(words_.graph.constant(inverse_lengthscale_outside) * (ratio - words_.graph.constant(1)));
+        const Expression root = words_.graph.apply(Operation::sqrt, growth);
+        features.push_back(words_.graph.constant(inverse_lengthscale_outside) * (root - words_.graph.constant(1)));
         latent.features = named(spec, [&] { return ExpressionFunction::of_state(features, words_.symbols, system_); });
       }
     }
@@ -122,49 +123,51 @@ class LatentMaker {
     }
     std::vector<Expression> directions(static_cast<std::size_t>(nq * nq), words_.graph.constant(0));
     for (Index j = 0; j < nq; ++j) {
-      directions[static_cast<std::size_t>(j * nq + j)] = words_.graph.constant(discrepancy.stddev[j]) * (ratio * ratio);
+      directions[static_cast<std::size_t>(j * nq + j)] = words_.graph.constant(discrepancy.stddev[j]) * growth;
     }
     latent.directions = ExpressionFunction::of_state_and_parameters(directions, words_.symbols, words_.graph, system_);
     return latent;
   }
 
  private:
-  // ratio to the range from which on a discrepancy grows no more, and how soon it forgets what it is within: as little of that remains
-  // at any ratio ρ > 1 as it grows, ρ² exp(−½ (6 (ρ − 1))²) < 1.06
-  static constexpr double largest_ratio = 4, inverse_lengthscale_outside = 6;
+  // how soon a discrepancy forgets outside the data what it is within: as little of that remains as it grows, γ exp(−18 (√γ − 1)²) < 1.06
+  static constexpr double inverse_lengthscale_outside = 6;
 
-  /// ρ = min(max(1, max_d |φ_d − m_d|/h_d), 4), theory.md T23.
+  /// γ = 1 + s/(1 + s/15), s = 4 Σ_d max(0, |φ_d − m_d|/h_d − 1)², theory.md T23.
   /// @param features  in units of the lengthscales
-  [[nodiscard]] Expression ratio_to_range(const std::vector<Expression>& features, const Discrepancy& discrepancy) const {
+  [[nodiscard]] Expression growth_of(const std::vector<Expression>& features, const Discrepancy& discrepancy) const {
     ExpressionGraph& graph = words_.graph;
     const VectorXd centre = discrepancy.centre.cwiseQuotient(discrepancy.lengthscale);
     const VectorXd half_range = discrepancy.half_range.cwiseQuotient(discrepancy.lengthscale);
-    Expression ratio = graph.constant(1);
+    const Expression one = graph.constant(1);
+    Expression s = graph.constant(0);
     for (Index d = 0; d < centre.size(); ++d) {
       const Expression gap = graph.apply(Operation::abs, features[static_cast<std::size_t>(d)] - graph.constant(centre[d]));
-      ratio = graph.apply(Operation::max, ratio, gap / graph.constant(half_range[d]));
+      const Expression outside = graph.apply(Operation::max, graph.constant(0), gap / graph.constant(half_range[d]) - one);
+      s = s + graph.constant(4) * outside * outside;
     }
-    return graph.apply(Operation::min, ratio, graph.constant(largest_ratio));
+    return one + s / (one + s / graph.constant(15));
   }
 
   /// The same of features that are code.
   void set_outside_of_code(const LatentSpec& spec, const Discrepancy& discrepancy, Latent& latent) const {
     const int nq = system_->nq();
-    const auto ratios = [discrepancy](const MatrixXd& features) -> Eigen::RowVectorXd {
+    const auto growth_at = [discrepancy](const MatrixXd& features) -> Eigen::RowVectorXd {
       const MatrixXd gaps = (discrepancy.lengthscale.asDiagonal() * features).colwise() - discrepancy.centre;
       const MatrixXd of_range = discrepancy.half_range.cwiseInverse().asDiagonal() * gaps;
-      return of_range.cwiseAbs().colwise().maxCoeff().cwiseMax(1).cwiseMin(largest_ratio);
+      const Eigen::RowVectorXd s = 4 * (of_range.cwiseAbs().array() - 1).cwiseMax(0).square().matrix().colwise().sum();
+      return 1 + s.array() / (1 + s.array() / 15);
     };
     StateCode features, directions;
     features.reads = directions.reads = spec.feature_code.reads;
-    features.evaluate = [ratios, of = latent.features](const auto& states, const auto& parameters) -> MatrixXd {
+    features.evaluate = [growth_at, of = latent.features](const auto& states, const auto& parameters) -> MatrixXd {
       const MatrixXd within = of->evaluate(states, parameters);
       MatrixXd all(within.rows() + 1, within.cols());
-      all << within, inverse_lengthscale_outside * (ratios(within).array() - 1).matrix();
+      all << within, inverse_lengthscale_outside * (growth_at(within).cwiseSqrt().array() - 1).matrix();
       return all;
     };
     directions.evaluate = [=, of = latent.features](const auto& states, const auto&) -> MatrixXd {
-      return MatrixXd(discrepancy.stddev.asDiagonal()).reshaped() * ratios(of->evaluate(states, VectorXd())).cwiseAbs2();
+      return MatrixXd(discrepancy.stddev.asDiagonal()).reshaped() * growth_at(of->evaluate(states, VectorXd()));
     };
     directions.differentiate = [nq](const auto& states, const auto&, int) -> MatrixXd {
       return MatrixXd::Zero(nq * nq, states.cols());
