@@ -133,7 +133,7 @@ class LatentMaker {
   // how soon a discrepancy forgets outside the data what it is within: as little of that remains as it grows, γ exp(−18 (√γ − 1)²) < 1.06
   static constexpr double inverse_lengthscale_outside = 6;
 
-  /// γ = 1 + s/(1 + s/15), s = 4 Σ_d max(0, |φ_d − m_d|/h_d − 1)², theory.md T23.
+  /// γ = 1 + s/(1 + s/15) = 16 − 225/(15 + s), s = 4 Σ_d max(0, |φ_d − m_d|/h_d − 1)², theory.md T23.
   /// @param features  in units of the lengthscales
   [[nodiscard]] Expression growth_of(const std::vector<Expression>& features, const Discrepancy& discrepancy) const {
     ExpressionGraph& graph = words_.graph;
@@ -146,7 +146,7 @@ class LatentMaker {
       const Expression outside = graph.apply(Operation::max, graph.constant(0), gap / graph.constant(half_range[d]) - one);
       s = s + graph.constant(4) * outside * outside;
     }
-    return one + s / (one + s / graph.constant(15));
+    return graph.constant(16) - graph.constant(225) / (graph.constant(15) + s);  // where s overflows too
   }
 
   /// The same of features that are code.
@@ -156,7 +156,7 @@ class LatentMaker {
       const MatrixXd gaps = (discrepancy.lengthscale.asDiagonal() * features).colwise() - discrepancy.centre;
       const MatrixXd of_range = discrepancy.half_range.cwiseInverse().asDiagonal() * gaps;
       const Eigen::RowVectorXd s = 4 * (of_range.cwiseAbs().array() - 1).cwiseMax(0).square().matrix().colwise().sum();
-      return 1 + s.array() / (1 + s.array() / 15);
+      return 16 - 225 / (15 + s.array());
     };
     StateCode features, directions;
     features.reads = directions.reads = spec.feature_code.reads;
