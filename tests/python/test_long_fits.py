@@ -94,16 +94,20 @@ def test_ctrl_c_ends_a_simulation():
     assert seconds < PATIENCE
 
 
-def test_ctrl_c_ends_a_search_with_the_best_motion_so_far():
-    out, err, status, seconds = interrupted(
-        """
+# indented as the programs that begin with it
+OF_A_CART = """
         import threading, gp2
         system = gp2.System(
             coordinates=["x"], inputs=["u"], mass=[["1"]], force=["u"], latents=[{"features": ["dx"]}], noise=0.1, truth=["0"],
             sampling={"x": [-1, 1], "dx": [-1, 1], "u": [-1, 1]},
         )
         posterior = gp2.fit(system, system.generate(5), mean="force", max_iterations=0)
-        threading.Timer(2, print, ["ready"], {"flush": True}).start()
+        threading.Timer(2, print, ["ready"], {"flush": True}).start()"""
+
+
+def test_ctrl_c_ends_a_search_with_the_best_motion_so_far():
+    out, err, status, seconds = interrupted(
+        OF_A_CART + """
         try:
             gp2.excite(posterior, {"x": 0}, 1, {"u": (-1, 1)}, n_rows=40, n_motions=100_000_000)
         except KeyboardInterrupt as stop:
@@ -118,14 +122,7 @@ def test_ctrl_c_ends_a_search_with_the_best_motion_so_far():
 
 def test_ctrl_c_ends_a_search_that_has_found_no_motion_within_the_limits():
     out, err, status, seconds = interrupted(
-        """
-        import threading, gp2
-        system = gp2.System(
-            coordinates=["x"], inputs=["u"], mass=[["1"]], force=["u"], latents=[{"features": ["dx"]}], noise=0.1, truth=["0"],
-            sampling={"x": [-1, 1], "dx": [-1, 1], "u": [-1, 1]},
-        )
-        posterior = gp2.fit(system, system.generate(5), mean="force", max_iterations=0)
-        threading.Timer(2, print, ["ready"], {"flush": True}).start()
+        OF_A_CART + """
         limits = {"inputs_within": {"u": (-1, 1)}, "within": {"x": (-0.5, 0.5)}}
         try:
             gp2.excite(posterior, {"x": 0, "dx": 50}, 1, **limits, n_rows=40, n_motions=100_000_000)
