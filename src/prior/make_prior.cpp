@@ -85,8 +85,8 @@ class LatentMaker {
     return latents;
   }
 
-  /// Features in units of the lengthscales, directions of the standard deviations, both with what they become outside the data: but for
-  /// one factor nothing is left to tune.
+  /// Features in units of the lengthscales, directions of the standard deviations, and both as T23 has them outside the data: but
+  /// for one factor nothing is left to tune.
   [[nodiscard]] Latent make_discrepancy(const LatentSpec& spec, const Discrepancy& discrepancy) {
     Latent latent;
     const bool has_lengthscales = discrepancy.lengthscale.size() > 0;
@@ -130,7 +130,8 @@ class LatentMaker {
   }
 
  private:
-  // how soon a discrepancy forgets outside the data what it is within: as little of that remains as it grows, γ exp(−18 (√γ − 1)²) < 1.06
+  // How soon a discrepancy forgets outside the data what it is within: as little of that remains as it grows,
+  // γ exp(−18 (√γ − 1)²) < 1.06.
   static constexpr double inverse_lengthscale_outside = 6;
 
   /// γ = 1 + s/(1 + s/15) = 16 − 225/(15 + s), s = 4 Σ_d max(0, |φ_d − m_d|/h_d − 1)², theory.md T23.

@@ -63,8 +63,8 @@ struct Discrepancy {
   Eigen::VectorXd lengthscale;  // of each of its features (D); empty: 1
   Eigen::VectorXd stddev;       // of each acceleration (nq), as large as the noise; the size is a factor of it
   Latent::Base base = Latent::Base::admissible;
-  /// Of each feature over the data (D): outside their range the standard deviation grows, as what was too small to be seen may, up to 16
-  /// times (theory.md, T23). Empty: it does not grow.
+  /// Of each feature over the data (D): outside their range the standard deviation grows up to 16 times, as what was too small to be
+  /// seen may (theory.md, T23). Empty: it does not grow.
   Eigen::VectorXd centre = {}, half_range = {};
 };
 
