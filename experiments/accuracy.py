@@ -29,6 +29,7 @@ PRIORS = {
     "and quadratic": ('kernel = "rq + linear + linear*linear"\nlengthscales = "per direction"\n', {}),
     "se + linear": ('kernel = "se + linear"\nlengthscales = "per direction"\n', {}),
     "rq + linear shared": ('kernel = "rq + linear"\n', {"hyperparameters": "integrate", "discrepancy": False}),
+    "scikit-learn": ("", None),
 }
 # no plain latent in every direction
 LEFT_OUT = {"massless_rod", "four_bar"}
@@ -85,15 +86,18 @@ def cell(file, prior, n, seed, threads, motions=0):
 
     latent, options = PRIORS[prior]
     system = with_prior(file, latent)
-    train = system.generate(n, seed=seed)
     began = time.monotonic()
-    posterior = gp2.fit(system, train, mean="force", estimate=[], threads=threads, **options)
+    if options is None:
+        posterior, motions = None, 0
+        predict = ordinary_gp(system, n, seed)
+    else:
+        posterior = gp2.fit(system, system.generate(n, seed=seed), mean="force", estimate=[], threads=threads, **options)
+
+        def predict(states):
+            prediction = posterior.predict(states)
+            return prediction.mean, prediction.std
+
     seconds = time.monotonic() - began
-
-    def predict(states):
-        prediction = posterior.predict(states)
-        return prediction.mean, prediction.std
-
     slow = np.array(system.states(system.generate(300, seed=seed + 5000, noise_std=0.0)))
     fast = slow.copy()
     nq = len(system.coordinates)
@@ -101,6 +105,51 @@ def cell(file, prior, n, seed, threads, motions=0):
     starts = np.array(system.states(system.generate(motions, seed=seed + 7000, noise_std=0.0))) if motions else []
     return [*scores(predict, slow, system.true_acceleration(slow)), *scores(predict, fast, system.true_acceleration(fast)), seconds,
             motion_coverage(system, posterior, starts, seed)]
+
+
+def ordinary_gp(system, n, seed):
+    """What scikit-learn predicts from the whole state: for each acceleration the most likely of five kernels, with own lengthscales and the
+    true noise. It learns what the known force under the constraint does not explain, as the others do by their prior mean."""
+    import warnings
+
+    import numpy as np
+    from sklearn.gaussian_process import GaussianProcessRegressor, kernels
+
+    def known(states):
+        mechanics = system.evaluate(states)
+        accelerations = []
+        for M, A, b, F in zip(mechanics.M, mechanics.A, mechanics.b, mechanics.F):
+            zero = np.zeros((len(b), len(b)))
+            accelerations.append(np.linalg.lstsq(np.block([[M, A.T], [A, zero]]), np.concatenate([F, b]), rcond=None)[0][: len(F)])
+        return np.array(accelerations)
+
+    train, exact = system.generate(n, seed=seed), system.generate(n, seed=seed, noise_std=0.0)
+    measured = np.column_stack([train[name] for name in system.acceleration_names])
+    noise = np.std(measured - np.column_stack([exact[name] for name in system.acceleration_names]), axis=0)
+    states = np.array(system.states(train))
+    varies = np.ptp(np.nan_to_num(states), axis=0) > 0  # NaN: what nothing reads
+    centre, scale = states[:, varies].mean(axis=0), states[:, varies].std(axis=0)
+    unknown = measured - known(states)
+    own = np.ones(np.count_nonzero(varies))
+    forms = [kernels.RBF(own), kernels.Matern(own, nu=1.5), kernels.Matern(own, nu=2.5), kernels.RationalQuadratic(),
+             kernels.RBF(own) + kernels.ConstantKernel() * kernels.DotProduct()]
+    regressors = []
+    for values, deviation in zip(unknown.T, noise):
+        size = np.std(values)
+        fits = [GaussianProcessRegressor(kernels.ConstantKernel() * form, alpha=(deviation / size) ** 2, n_restarts_optimizer=2,
+                                         random_state=seed) for form in forms]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of lengthscales at their bounds, for features that do not matter
+            for fit in fits:
+                fit.fit((states[:, varies] - centre) / scale, values / size)
+        regressors.append((max(fits, key=lambda fit: fit.log_marginal_likelihood_value_), size))
+
+    def predict(states):
+        parts = [fit.predict((states[:, varies] - centre) / scale, return_std=True) for fit, _ in regressors]
+        means, stds = ([part[k] * size for part, (_, size) in zip(parts, regressors)] for k in (0, 1))
+        return known(states) + np.column_stack(means), np.column_stack(stds)
+
+    return predict
 
 
 def covered(rows, keys, figure):

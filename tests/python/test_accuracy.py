@@ -42,3 +42,9 @@ def test_the_default_prior_is_sharper_and_more_honest_than_one_kernel_for_all_di
     assert statistics.fmean(covered) > 0.85
     assert min(covered_fast) > 0.8  # surface 0.6 where the discrepancy does not grow outside the data
     assert statistics.fmean(of_motions) > 0.6
+
+
+def test_an_ordinary_gp_that_is_told_the_known_force_learns_less(bench):
+    surface = next(file for file in bench.mechanisms("all") if file.stem == "surface")
+    ordinary, default = (bench.cell(surface, prior, 50, 1, 2) for prior in ("scikit-learn", "default"))
+    assert default[0] < ordinary[0] < 0.05
