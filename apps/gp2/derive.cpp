@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/suggestion.hpp"
 #include "command.hpp"
 #include "gp2/base/statistics.hpp"
 #include "streams.hpp"
@@ -19,11 +20,6 @@ struct DeriveArguments {
   std::string log, model, like, output;
   DeriveOptions options;
 };
-
-// "2 gaps, the longest 0.3 s"
-std::string count_of(int n, const std::string& one, const std::string& many) {
-  return fmt::format("{} {}", n, n == 1 ? one : many);
-}
 
 std::string text_of(const std::vector<const DerivedSeries*>& series) {
   const auto middle = [&](auto member) {
@@ -47,21 +43,19 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
     text += fmt::format(", resolution {:.3g}", resolution);
   }
   std::vector<std::string> counts;
-  if (const int n = total(&DerivedSeries::outliers); n > 0)
-    counts.push_back(count_of(n, "outlier left out", "outliers left out"));
+  if (const int n = total(&DerivedSeries::outliers); n > 0) counts.push_back(counted(n, "outlier left out", "outliers left out"));
   if (const int n = total(&DerivedSeries::repeated); n > 0) counts.push_back(fmt::format("{} repeated", n));
   if (const int n = total(&DerivedSeries::missing); n > 0) counts.push_back(fmt::format("{} missing", n));
   if (const int n = total(&DerivedSeries::wraps); n > 0)
-    counts.push_back(count_of(n, "jump of 2π removed", "jumps of 2π removed"));
+    counts.push_back(counted(n, "jump of 2π removed", "jumps of 2π removed"));
   if (const int n = total(&DerivedSeries::gaps); n > 0) {
     double longest = 0;
     for (const DerivedSeries* one : series) longest = std::max(longest, one->longest_gap);
-    counts.push_back(fmt::format("{}, the longest {:.3g} s", count_of(n, "gap", "gaps"), longest));
+    counts.push_back(fmt::format("{}, the longest {:.3g} s", counted(n, "gap"), longest));
   }
   const auto shared = std::count_if(series.begin(), series.end(), [](const DerivedSeries* one) { return one->shared_model; });
   if (shared > 0)
-    counts.push_back(count_of(static_cast<int>(shared), "episode too short for a model of its own",
-                              "episodes too short for a model of their own"));
+    counts.push_back(counted(shared, "episode too short for a model of its own", "episodes too short for a model of their own"));
   const auto add_if_any = [&](bool DerivedSeries::*is, const std::string& what) {
     const auto n = std::count_if(series.begin(), series.end(), [is](const DerivedSeries* one) { return one->*is; });
     if (n > 0) counts.push_back(what + (series.size() > 1 ? fmt::format(" in {} of {} episodes", n, series.size()) : ""));
@@ -102,7 +96,7 @@ void run(DeriveArguments& arguments) {
   std::vector<std::string> independent;
   for (const int j : data.independent) independent.push_back(model.system->acceleration_names()[static_cast<std::size_t>(j)]);
   print_notes({fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
-                           count_of(static_cast<int>(episodes.size()), "episode", "episodes"), fmt::join(independent, ", "))});
+                           counted(episodes.size(), "episode"), fmt::join(independent, ", "))});
 }
 
 }  // namespace

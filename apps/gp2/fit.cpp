@@ -138,10 +138,11 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
   for (const ActuatorEstimate& one : report.actuators) {
     json["actuators"].push_back({{"name", one.name},
                                  {"value", one.value},
-                                 {"stddev", one.stddev},
+                                 {"std", one.stddev},
                                  {"lower", one.lower},
                                  {"upper", one.upper},
-                                 {"at_bound", one.at_lower() || one.at_upper()}});
+                                 {"at_bound", one.at_lower() || one.at_upper()},
+                                 {"moves", one.moves}});
   }
   if (outcome.cross_validation) {
     const auto scores = [](const LeftOutScores& of) {

@@ -84,19 +84,20 @@ std::string build_and_machine() {
   return text;
 }
 
-// CLI11 would only say that a command is missing
-void require_known_command(const std::vector<gp2::command::Command>& commands, int argc, char** argv) {
-  if (argc < 2 || argv[1][0] == '-') return;
+// The one that is to run, "" where only options are given. CLI11 would say of an unknown one that a command is missing.
+std::string known_command(const std::vector<gp2::command::Command>& commands, int argc, char** argv) {
+  if (argc < 2 || argv[1][0] == '-') return "";
   std::vector<std::string> names;
   for (const gp2::command::Command& command : commands) names.push_back(command.name);
-  if (std::find(names.begin(), names.end(), argv[1]) != names.end()) return;
+  if (std::find(names.begin(), names.end(), argv[1]) != names.end()) return argv[1];
   std::string mend = gp2::suggestion(argv[1], names);
   if (mend.empty()) mend = fmt::format("; there are: {}", fmt::join(names, ", "));
   throw gp2::command::UsageError{fmt::format("there is no command '{}'{}", argv[1], mend)};
 }
 
-int usage_error(const std::string& text) {
-  return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", text));
+// command: the one that is to run, or ""
+int usage_error(const std::string& text, const std::string& command) {
+  return failed(exit_bad_input, fmt::format("error: {}\nRun gp2{} --help.", text, command.empty() ? "" : " " + command));
 }
 
 gp2::Option quiet_option() {
@@ -143,9 +144,10 @@ int main(int argc, char** argv) {
   for (const gp2::command::Command& command : commands) gp2::command::add_command(app, command);
   app.formatter_fn([&](auto&&...) { return gp2::command::help_page(commands, gp2::command::help_width()); });
 
+  std::string running;
   try {
-    require_known_command(commands, argc, argv);
-    if (argc > 1 && std::string(argv[1]) != "fit" && gp2::command::n_started_together() > 1) {
+    running = known_command(commands, argc, argv);
+    if (argc > 1 && running != "fit" && gp2::command::n_started_together() > 1) {
       throw gp2::InputError("mpirun is for gp2 fit; start this command alone");
     }
     app.parse(argc, argv);
@@ -156,9 +158,9 @@ int main(int argc, char** argv) {
   } catch (const CLI::ParseError& error) {
     // CLI11 names an option that is missing before one that is misspelt
     const std::string unknown = gp2::command::unknown_option(app);
-    return usage_error(unknown.empty() ? gp2::command::in_plain_words(error.what()) : unknown);
+    return usage_error(unknown.empty() ? gp2::command::in_plain_words(error.what()) : unknown, running);
   } catch (const gp2::command::UsageError& error) {
-    return usage_error(error.text);
+    return usage_error(error.text, running);
   } catch (const gp2::command::Interrupted& interrupted) {
     return 128 + interrupted.signal;
   } catch (const gp2::InputError& error) {

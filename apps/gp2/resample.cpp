@@ -2,9 +2,6 @@
 
 #include <memory>
 
-#include <fmt/format.h>
-#include <fmt/ranges.h>
-
 #include "command.hpp"
 
 namespace gp2::command {
@@ -22,15 +19,7 @@ void run(const ResampleArguments& arguments) {
   const CsvTable log = CsvTable::read(arguments.log);
   const Resample chosen = resample(model, log, arguments.options);
   log.take(chosen.rows).write(arguments.output);
-  if (chosen.n_skipped > 0)
-    print_notes({fmt::format("{}: {} rows skipped: a feature has no value", arguments.log, chosen.n_skipped)});
-  print_notes({fmt::format("distances are in {}, each divided by its standard deviation", fmt::join(chosen.features, ", ")),
-               fmt::format("{}: {} of {} rows; every other row is within {:.3g} of one of them", arguments.output,
-                           chosen.rows.size(), log.n_rows(), chosen.radius)});
-  const auto n_repeating = (chosen.distance.array() == 0).count() - 1;  // the first has none before it
-  if (n_repeating > 0)
-    print_notes(
-        {fmt::format("the last {} rows repeat those before them in every feature: fewer cover the log as well", n_repeating)});
+  print_notes(resample_notes(chosen, log, arguments.output));
 }
 
 }  // namespace

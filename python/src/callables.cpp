@@ -303,6 +303,9 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
 }
 
 PySystem from_keywords(const py::kwargs& kwargs, const char* name, ModelCode code) {
+  // an iterator gives its items once, and two read them here
+  if (kwargs.contains("latents") && py::isinstance<py::iterator>(kwargs["latents"]))
+    kwargs["latents"] = py::list(kwargs["latents"]);
   const py::object model_text = py::module_::import("gp2._model_text").attr("model_text");
   const py::dict known = model_text.attr("__kwdefaults__");
   for (const auto& [keyword, value] : kwargs) {

@@ -184,7 +184,7 @@ py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwar
   std::vector<std::string> notes = log.data.notes;
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
   tell(notes);
-  report["notes"] = notes;
+  report["notes"] = with_keywords(std::move(notes));
   report["gains"] = log.gains;
   CsvTable smoothed = as_table(log.data, system.system(), "smoothed data");
   request = log.request(std::move(request), "raw data");

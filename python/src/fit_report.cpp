@@ -8,6 +8,39 @@
 #include "bindings.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
+#include "pickles.hpp"
+
+// for pickles
+namespace gp2 {
+
+static auto fields(HyperPrior& of) { return std::tie(of.form, of.median, of.stddev, of.family, of.correlation); }
+static auto fields(Hyperparameter::Follower& of) { return std::tie(of.latent, of.column, of.share); }
+static auto fields(Hyperparameter& of) {
+  return std::tie(of.kind, of.owner, of.index, of.column_scale, of.name, of.unit, of.value, of.lower, of.upper, of.positive,
+                  of.size, of.hyperprior, of.followers);
+}
+static auto fields(RestartReport& of) {
+  return std::tie(of.objective, of.negative_log_likelihood, of.iterations, of.evaluations, of.failed_evaluations, of.converged,
+                  of.termination);
+}
+static auto fields(LaplaceUncertainty& of) {
+  return std::tie(of.stddev, of.correlation, of.held, of.undetermined, of.distance_from_optimum);
+}
+static auto fields(HyperparameterDraws& of) {
+  return std::tie(of.values, of.mean, of.stddev, of.lower, of.upper, of.r_hat, of.effective_size, of.correlation, of.n_chains,
+                  of.evaluations, of.acceptance, of.n_impossible);
+}
+static auto fields(ActuatorEstimate& of) { return std::tie(of.name, of.value, of.stddev, of.lower, of.upper, of.moves); }
+static auto fields(DistrustedValue& of) { return std::tie(of.group, of.row, of.state, of.distance, of.noise_factor); }
+// what Python is told of it: not the points themselves
+static auto fields(InducingReport& of) { return std::tie(of.n_variables, of.left_out, of.n_start); }
+static auto fields(FitReport& of) {
+  return std::tie(of.hyperparameters, of.negative_log_likelihood, of.objective, of.converged, of.termination, of.iterations,
+                  of.best_restart, of.n_escapes, of.restarts, of.uncertainty, of.draws, of.actuators, of.distrusted, of.inducing,
+                  of.seconds);
+}
+
+}  // namespace gp2
 
 namespace gp2::python {
 
@@ -129,7 +162,8 @@ void define_report(py::class_<FitReport>& report) {
            })
       .def(
           "__iter__", [](const FitReport& self) { return py::iter(py::cast(names_of(self))); }, "Names of the hyperparameters.")
-      .def("__repr__", &text_of);
+      .def("__repr__", &text_of)
+      .def(pickled<FitReport>());
 }
 
 }  // namespace
@@ -142,12 +176,14 @@ void add_fit_report(py::module_& module) {
       .def_readonly("lower", &Hyperparameter::lower, "Bound of the search.")
       .def_readonly("upper", &Hyperparameter::upper, "Bound of the search.")
       .def_property_readonly("at_bound", &Hyperparameter::at_bound, "Whether the value lies at a bound.")
-      .def("__repr__", [](const Hyperparameter& h) {
-        return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
-                           h.is_fixed()   ? ", held"
-                           : h.at_bound() ? ", at its bound"
-                                          : "");
-      });
+      .def("__repr__",
+           [](const Hyperparameter& h) {
+             return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
+                                h.is_fixed()   ? ", held"
+                                : h.at_bound() ? ", at its bound"
+                                               : "");
+           })
+      .def(pickled<Hyperparameter>());
   py::class_<RestartReport>(module, "RestartReport", "How one run of the optimiser ended.")
       .def_readonly("objective", &RestartReport::objective, "-log p(y) with hyper-priors, at its end.")
       .def_readonly("negative_log_likelihood", &RestartReport::negative_log_likelihood, "-log p(y) at its end.")
@@ -155,7 +191,8 @@ void add_fit_report(py::module_& module) {
       .def_readonly("evaluations", &RestartReport::evaluations, "Of the objective and its gradient.")
       .def_readonly("failed_evaluations", &RestartReport::failed_evaluations, "That gave no number.")
       .def_readonly("converged", &RestartReport::converged, "Whether it met its tolerances.")
-      .def_readonly("termination", &RestartReport::termination, "Which inequality stopped it.");
+      .def_readonly("termination", &RestartReport::termination, "Which inequality stopped it.")
+      .def(pickled<RestartReport>());
   py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
   define_report(report);
 }

@@ -8,6 +8,29 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/simulate_job.hpp"
 #include "options.hpp"
+#include "pickles.hpp"
+
+// for pickles
+namespace gp2 {
+
+static auto fields(ContactEvent& of) { return std::tie(of.time, of.row, of.kind, of.approach, of.energy_loss); }
+static auto fields(StickEvent& of) { return std::tie(of.time, of.surface, of.sticks); }
+static auto fields(LowerRank& of) { return std::tie(of.usual, of.lowest, of.states); }
+static auto fields(Trajectory& of) {
+  return std::tie(of.times, of.states, of.accelerations, of.commands, of.records, of.max_position_drift, of.max_velocity_drift,
+                  of.largest_jump, of.jump_time, of.lower_rank, of.start_position_residual, of.start_velocity_residual,
+                  of.start_displacement, of.events, of.sticks, of.steps, of.rejected_steps, of.evaluations, of.seconds);
+}
+static auto fields(MotionUncertainty& of) { return std::tie(of.stddev, of.distance, of.leaves_data); }
+static auto fields(MotionEnergy& of) { return std::tie(of.values, of.stddev); }
+static auto fields(Excitation::Known& of) { return std::tie(of.name, of.now, of.after, of.random); }
+static auto fields(Excitation::LimitUse& of) { return std::tie(of.name, of.lower, of.upper, of.lowest, of.highest, of.share); }
+static auto fields(Excitation& of) {
+  return std::tie(of.target, of.motion, of.factor, of.random_factor, of.parameters, of.accelerations, of.limits, of.n_motions,
+                  of.n_random, of.n_failed, of.highest_frequency, of.leaves_data, of.interrupted, of.seconds, of.notes);
+}
+
+}  // namespace gp2
 
 namespace gp2::python {
 
@@ -18,9 +41,19 @@ using Eigen::VectorXd;
 
 namespace {
 
+/// gp2.Motion
 struct Motion : SimulatedMotion {
-  std::shared_ptr<const System> system;
+  CsvTable table;
+  std::vector<std::string> constraints, surfaces;  // which events are of
 };
+
+auto fields(Motion& of) { return std::tie(of.trajectory, of.uncertainty, of.energy, of.table, of.constraints, of.surfaces); }
+
+/// With what is named after the system that moved.
+Motion named(SimulatedMotion motion, const System& system, const SwitchingFunctions& switching) {
+  CsvTable table = as_table(motion.trajectory, system, "motion");
+  return {std::move(motion), std::move(table), system.constraint_labels(), switching.names()};
+}
 
 // A path, or a table, which has named columns where a Series of numbers by name has none.
 bool is_log(const py::object& start) {
@@ -47,25 +80,48 @@ SimulateRequest simulate_request(const System& system, const py::object& start, 
   return request;
 }
 
-/// Motions one after the other; Ctrl-C ends them.
-std::vector<SimulatedMotion> run_motions(const SimulateJob& job) {
+/// Throws a gp2.NumericalError with what was reached as its attribute `motion`.
+[[noreturn]] void raise_unfinished(const std::string& text, const py::object& motion) {
+  const py::object type = py::module_::import("gp2._gp2").attr("NumericalError"), error = type(with_keywords(text));
+  error.attr("motion") = motion;
+  PyErr_SetObject(type.ptr(), error.ptr());
+  throw py::error_already_set();
+}
+
+using Uncertainty = std::function<MotionUncertainty(const Trajectory&)>;
+
+/// The motions of a job, one after the other: a Motion, or a list of them; Ctrl-C ends them.
+/// @throws as raise_unfinished, where one cannot go on
+py::object run_motions(const SimulateJob& job, bool are_many, const Uncertainty& uncertainty) {
   tell(job.notes);
-  std::vector<Trajectory> trajectories = run_or_raise([&](const std::atomic<bool>* stop) { return run_simulation(job, stop); });
+  std::vector<Trajectory> trajectories;
+  std::string unfinished;
+  try {
+    trajectories = run_or_raise([&](const std::atomic<bool>* stop) { return run_simulation(job, stop); });
+  } catch (UnfinishedMotion& error) {
+    trajectories = std::move(error.motions);
+    unfinished = error.what();
+    if (trajectories.back().times.size() == 0) trajectories.pop_back();  // it did not begin
+  }
   std::vector<SimulatedMotion> motions;
   for (std::size_t k = 0; k < trajectories.size(); ++k) {
     SimulatedMotion& motion = motions.emplace_back(SimulatedMotion{std::move(trajectories[k])});
     const auto& energy = job.motions[k].energy;
     if (energy) motion.energy = unlocked([&] { return energy(motion.trajectory.states); });
+    if (uncertainty) motion.uncertainty = unlocked([&] { return uncertainty(motion.trajectory); });
   }
-  return motions;
+  tell(motion_notes(motions));
+  py::list out;
+  for (SimulatedMotion& motion : motions) out.append(named(std::move(motion), *job.system, job.options.switching));
+  const py::object result = are_many ? py::object(out) : out.empty() ? py::none() : py::object(out[0]);
+  if (!unfinished.empty()) raise_unfinished(unfinished, result);
+  return result;
 }
 
-Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
-                      const py::kwargs& keywords) {
+py::object simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
+                          const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  std::vector<SimulatedMotion> motions = run_motions(prepare_simulation(*system.model, request));
-  tell(motion_notes(motions));
-  return {std::move(motions[0]), system.model->system};
+  return run_motions(prepare_simulation(*system.model, request), /*are_many=*/false, {});
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
@@ -74,14 +130,8 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   const Posterior posterior = self.posterior;
   const FitSystem asked = system_of(self.file, posterior.prior(), model_of(system));
   const SimulateJob job = unlocked([&] { return prepare_simulation(asked, posterior, request); });
-  std::vector<SimulatedMotion> motions = run_motions(job);
-  for (SimulatedMotion& motion : motions) {
-    motion.uncertainty = unlocked([&] { return motion_uncertainty(posterior, motion.trajectory, asked.other_system); });
-  }
-  tell(motion_notes(motions));
-  std::vector<Motion> out;
-  for (SimulatedMotion& motion : motions) out.push_back({std::move(motion), asked.model->system});
-  return request.n_samples ? py::cast(std::move(out)) : py::cast(std::move(out[0]));
+  return run_motions(job, request.n_samples.has_value(),
+                     [&](const Trajectory& motion) { return motion_uncertainty(posterior, motion, asked.other_system); });
 }
 
 std::string simulate_documentation(const std::string& first, const std::string& last, const std::string& result) {
@@ -98,8 +148,9 @@ std::string simulate_documentation(const std::string& first, const std::string& 
 struct PyExcitation {
   Excitation found;
   Motion motion;
-  std::shared_ptr<const System> system;
+  CsvTable table;
 };
+auto fields(PyExcitation& of) { return std::tie(of.found, of.motion, of.table); }
 
 Limits limits_argument(const py::object& limits, const std::string& name) {
   if (limits.is_none()) return {};
@@ -119,8 +170,10 @@ PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, 
   std::atomic<bool> stop = false;
   const auto search = [&] {
     Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, &stop);
-    MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
-    return PyExcitation{found, {{found.motion, std::move(uncertainty)}, driven.model->system}, driven.model->system};
+    SimulatedMotion motion{found.motion, motion_uncertainty(posterior, found.motion, driven.other_system)};
+    const System& moved = *driven.model->system;
+    return PyExcitation{found, named(std::move(motion), moved, switching_functions(*driven.model, /*of_latents=*/true)),
+                        as_table(found.motion, moved, "excitation")};
   };
   std::exception_ptr raised;
   std::optional<PyExcitation> out;
@@ -150,6 +203,28 @@ py::dict limits_dict(const std::vector<Excitation::LimitUse>& limits) {
                                       "highest"_a = one.highest, "share"_a = one.share);
   }
   return out;
+}
+
+// as the JSON of gp2 simulate has them
+py::list contact_events(const Motion& motion) {
+  const auto word_of = [](ContactEvent::Kind kind) {
+    return kind == ContactEvent::Kind::impact ? "impact" : kind == ContactEvent::Kind::made ? "made" : "released";
+  };
+  py::list events;
+  for (const ContactEvent& one : motion.trajectory.events) {
+    events.append(py::dict("t"_a = one.time, "contact"_a = motion.constraints[static_cast<std::size_t>(one.row)],
+                           "kind"_a = word_of(one.kind), "approach"_a = one.approach, "energy_loss"_a = one.energy_loss));
+  }
+  return events;
+}
+
+py::list stick_events(const Motion& motion) {
+  py::list events;
+  for (const StickEvent& one : motion.trajectory.sticks) {
+    events.append(py::dict("t"_a = one.time, "surface"_a = motion.surfaces[static_cast<std::size_t>(one.surface)],
+                           "kind"_a = one.sticks ? "sticks" : "slips"));
+  }
+  return events;
 }
 
 }  // namespace
@@ -212,23 +287,32 @@ void add_motion(py::module_& module) {
           "n_lower_rank", [](const Motion& m) { return m.trajectory.lower_rank.states.size(); },
           "Times at which the constraints have a lower rank than at others.")
       .def_property_readonly(
-          "table", [](const Motion& m) { return as_table(m.trajectory, *m.system, "motion"); },
-          "t, q, dq, ddq and the inputs as commanded: fit takes it as a log, simulate as inputs.")
+          "start_displacement", [](const Motion& m) { return m.trajectory.start_displacement; },
+          "By how much, at most, the projection of the start onto the constraints changed a coordinate or velocity.")
+      .def_property_readonly(
+          "contact_events", &contact_events,
+          "What happened to contacts, in the order of time: dicts of t, contact (the constraint as written), kind "
+          "('impact', 'made' or 'released'), approach (the speed before an impact) and energy_loss [J].")
+      .def_property_readonly(
+          "stick_events", &stick_events,
+          "Where dry friction starts to hold the motion and lets it go: dicts of t, surface (what is 0 while it "
+          "holds) and kind ('sticks' or 'slips').")
+      .def_readonly("table", &Motion::table,
+                    "t, q, dq, ddq and the inputs as commanded: fit takes it as a log, simulate as inputs.")
       .def_property_readonly(
           "steps", [](const Motion& m) { return m.trajectory.steps; }, "Of the integrator.")
       .def_property_readonly(
           "rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; },
           "Whose error was above the tolerance, or that had no finite acceleration.")
       .def_property_readonly(
-          "evaluations", [](const Motion& m) { return m.trajectory.evaluations; }, "Of the acceleration.");
+          "evaluations", [](const Motion& m) { return m.trajectory.evaluations; }, "Of the acceleration.")
+      .def(pickled<Motion>());
 }
 
 void add_excitation(py::module_& module) {
   py::class_<PyExcitation>(module, "Excitation", "A motion to drive a system along, and what measuring it is expected to tell.")
       .def_readonly("motion", &PyExcitation::motion, "As the fit predicts it.")
-      .def_property_readonly(
-          "table", [](const PyExcitation& e) { return as_table(e.found.motion, *e.system, "excitation"); },
-          "t, q, dq, ddq and the inputs: simulate takes it as inputs.")
+      .def_readonly("table", &PyExcitation::table, "t, q, dq, ddq and the inputs: simulate takes it as inputs.")
       .def_property_readonly(
           "parameters", [](const PyExcitation& e) { return known_dict(e.found.parameters); },
           "Standard deviation of each estimated parameter: now, after this motion, after a random one (median).")
@@ -255,7 +339,8 @@ void add_excitation(py::module_& module) {
       .def_property_readonly(
           "n_failed", [](const PyExcitation& e) { return e.found.n_failed; }, "That could not be integrated.")
       .def_property_readonly(
-          "seconds", [](const PyExcitation& e) { return e.found.seconds; }, "That the search took.");
+          "seconds", [](const PyExcitation& e) { return e.found.seconds; }, "That the search took.")
+      .def(pickled<PyExcitation>());
 }
 
 /// These have their keywords in signatures of our own; the setting for that ends with this function.
@@ -276,7 +361,8 @@ system  another System with the same coordinates, inputs and latents: its motion
 
 )" + motion_options +
                  R"(
-Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
+Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on; its attribute `motion` is
+what was reached: a Motion up to there (None where there is none), or with n_samples the list up to that one.)")
                     .c_str());
   module.def("simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
              (simulate_documentation("system: System, ", "", "Motion") +

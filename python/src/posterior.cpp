@@ -21,6 +21,35 @@
 #include "gp2/jobs/shoot_job.hpp"
 #include "gp2/jobs/update_job.hpp"
 #include "options.hpp"
+#include "pickles.hpp"
+
+// for pickles
+namespace gp2 {
+
+static auto fields(Calibration& of) {
+  return std::tie(of.coverage50, of.coverage80, of.coverage95, of.coverage50_latent, of.coverage80_latent, of.coverage95_latent,
+                  of.pit);
+}
+static auto fields(Evaluation::Part& of) {
+  return std::tuple_cat(fields(static_cast<Calibration&>(of)), std::tie(of.n, of.nrmse));
+}
+static auto fields(Evaluation& of) {
+  return std::tuple_cat(
+      fields(static_cast<Calibration&>(of)),
+      std::tie(of.outputs, of.rmse, of.rmse_normalised, of.nrmse, of.max_constraint_error, of.max_constraint_error_fitted,
+               of.nlpd, of.nlpd_latent, of.n_zero_variance, of.near, of.far, of.n, of.n_missing));
+}
+static auto fields(LeftOutScores& of) { return std::tie(of.view, of.one_by_one, of.stretches, of.values, of.nrmse_of_noise); }
+static auto fields(TrainingResidual& of) {
+  return std::tie(of.group, of.output, of.n, of.rms, of.coverage95, of.serial_correlation, of.rms_in_noise, of.n_far, of.farthest,
+                  of.farthest_state, of.is_of_ddq);
+}
+static auto fields(CrossValidation& of) {
+  return std::tuple_cat(fields(static_cast<LeftOutScores&>(of)), std::tie(of.other_views, of.residuals));
+}
+static auto fields(InverseDynamics& of) { return std::tie(of.inputs, of.covariance, of.missed); }
+
+}  // namespace gp2
 
 namespace gp2::python {
 
@@ -71,6 +100,7 @@ struct Prediction {
   std::vector<std::string> names;
   int n_clipped = 0;
 };
+auto fields(Prediction& of) { return std::tie(of.mean, of.std, of.cov, of.distance_from_data, of.names, of.n_clipped); }
 
 /// States between two looks for Ctrl-C: some tenths of a second of work, in whole blocks of what the library takes at once.
 Index states_between_signals(const Posterior& posterior, bool mean_only, Index d, int n_threads) {
@@ -89,6 +119,7 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
   const auto x = asked.states.matrix();
   const Index d = view.size(), n = x.cols();
   MatrixXd mean(d, n), stddev(mean_only ? 0 : d, n), covariance(mean_only ? 0 : d * d, n);
+  VectorXd distance(n);
   Prediction out;
   const Posterior posterior = self.posterior;  // stays as it is, whatever another Python thread does with self
   const Index most = states_between_signals(posterior, mean_only, d, n_threads);
@@ -105,6 +136,7 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
           covariance.middleCols(first, size) = block.covariance;
           out.n_clipped += block.n_clipped;
         }
+        distance.segment(first, size) = posterior.distance_from_data(view, x.middleCols(first, size), n_threads);
       } catch (const InputError&) {
         // once more, to name the state by its number among all
         static_cast<void>(posterior.mean(view, x.leftCols(first + size), n_threads));
@@ -113,7 +145,6 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
     });
     if (PyErr_CheckSignals() != 0) throw py::error_already_set();
   }
-  VectorXd distance = unlocked([&] { return posterior.distance_from_data(view, x, n_threads); });
   // arrays may be single states of a loop, which is not to be slowed down
   if (!mean_only && !is_array(data)) {
     for (const auto& note : unlocked([&] {
@@ -140,6 +171,7 @@ py::array asked_for(const std::optional<py::array>& values) {
 py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, const py::object& columns) {
   const Asked asked(self, view_request(arguments), data, columns);
   const Posterior posterior = self.posterior;
+  require_memory_of_joint(posterior, asked.at.view, asked.states.matrix().cols(), free_memory());
   Posterior::Joint result = asked.unlocked_and_named([&] { return posterior.joint(asked.at.view, asked.states.matrix()); });
   return py::make_tuple(to_vector(std::move(result.mean)), to_rows(std::move(result.covariance)));
 }
@@ -176,6 +208,7 @@ struct Inputs {
   InverseDynamics found;
   std::vector<std::string> names;
 };
+auto fields(Inputs& of) { return std::tie(of.found, of.names); }
 
 Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, const py::object& accelerations,
                            const GivenNames& given_outputs, const PySystem* system, const py::object& columns) {
@@ -223,9 +256,11 @@ void add_inputs(py::module_& module) {
           "missed", [](const Inputs& i) { return to_rows(i.found.missed); },
           "Wanted less predicted accelerations under these inputs (n, d): rounding where the wanted can be produced.")
       .def_readonly("names", &Inputs::names, "Of the inputs.")
-      .def("__repr__", [](const Inputs& i) {
-        return fmt::format("<gp2.Inputs {} at {} states>", fmt::join(i.names, ", "), i.found.inputs.cols());
-      });
+      .def("__repr__",
+           [](const Inputs& i) {
+             return fmt::format("<gp2.Inputs {} at {} states>", fmt::join(i.names, ", "), i.found.inputs.cols());
+           })
+      .def(pickled<Inputs>());
 }
 
 // ---------------------------------------------------------------- figures
@@ -347,9 +382,11 @@ void add_prediction(py::module_& module) {
                     "rule.")
       .def_readonly("names", &Prediction::names, "Of the d rows, as the columns of gp2 predict.")
       .def_readonly("n_clipped", &Prediction::n_clipped, "Variances that rounding made negative; they are 0.")
-      .def("__repr__", [](const Prediction& p) {
-        return fmt::format("<gp2.Prediction of {} at {} states>", fmt::join(p.names, ", "), p.mean.shape(0));
-      });
+      .def("__repr__",
+           [](const Prediction& p) {
+             return fmt::format("<gp2.Prediction of {} at {} states>", fmt::join(p.names, ", "), p.mean.shape(0));
+           })
+      .def(pickled<Prediction>());
 }
 
 void add_evaluation(py::module_& module) {
@@ -364,21 +401,25 @@ void add_evaluation(py::module_& module) {
       .def_readonly("coverage95_latent", &Calibration::coverage95_latent, "In their 95 % intervals.")
       .def_property_readonly(
           "pit", [](const Calibration& c) { return to_vector(c.pit); },
-          "Share of measurements in each tenth of their predictive distributions: all 0.1 where errors are as predicted.");
+          "Share of measurements in each tenth of their predictive distributions: all 0.1 where errors are as predicted.")
+      .def(pickled<Calibration>());
   py::class_<Evaluation::Part, Calibration>(module, "EvaluationPart", "Figures of some of the points.")
       .def_readonly("n", &Evaluation::Part::n, "Of these points.")
-      .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.");
+      .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.")
+      .def(pickled<Evaluation::Part>());
   py::class_<LeftOutScores>(module, "LeftOutScores", "Scores of the data of one view, where the fit has not seen them.")
       .def_readonly("view", &LeftOutScores::view, "Such as multipliers; empty: the accelerations.")
       .def_readonly("one_by_one", &LeftOutScores::one_by_one, "Each row from all others.")
       .def_readonly(
           "stretches", &LeftOutScores::stretches,
           "Each of five stretches of time from the rest: what a motion elsewhere would meet. None where the rows are in "
-          "no order of time.");
+          "no order of time.")
+      .def(pickled<LeftOutScores>());
   py::class_<CrossValidation, LeftOutScores>(module, "CrossValidation",
                                              "Scores of the data of a fit, where it has not seen them.")
       .def_readonly("other_views", &CrossValidation::other_views, "Of data of other views, as of forces.")
-      .def("__repr__", [](const CrossValidation& c) { return fmt::format("<gp2.CrossValidation: {}>", c.text()); });
+      .def("__repr__", [](const CrossValidation& c) { return fmt::format("<gp2.CrossValidation: {}>", c.text()); })
+      .def(pickled<CrossValidation>());
   py::class_<Evaluation, Calibration>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
       .def_readonly("outputs", &Evaluation::outputs, "Names of the accelerations.")
       .def_property_readonly(
@@ -395,14 +436,16 @@ void add_evaluation(py::module_& module) {
       .def_readonly("far", &Evaluation::far, "Of those farther from the data than FAR_FROM_DATA.")
       .def_readonly("n", &Evaluation::n, "Points.")
       .def_readonly("n_missing", &Evaluation::n_missing, "Targets that are not measured, left out of all figures.")
-      .def("__repr__", [](const Evaluation& e) {
-        std::string rmse;
-        for (std::size_t k = 0; k < e.outputs.size(); ++k) {
-          rmse += fmt::format("{}rmse {} {:.4g}", k == 0 ? "" : ", ", e.outputs[k], e.rmse[static_cast<Index>(k)]);
-        }
-        return fmt::format("<gp2.Evaluation at {} points: {}; nrmse {:.4g}; max |A ddq - b| {:.2g}>", e.n, rmse, e.nrmse,
-                           e.max_constraint_error_fitted);
-      });
+      .def("__repr__",
+           [](const Evaluation& e) {
+             std::string rmse;
+             for (std::size_t k = 0; k < e.outputs.size(); ++k) {
+               rmse += fmt::format("{}rmse {} {:.4g}", k == 0 ? "" : ", ", e.outputs[k], e.rmse[static_cast<Index>(k)]);
+             }
+             return fmt::format("<gp2.Evaluation at {} points: {}; nrmse {:.4g}; max |A ddq - b| {:.2g}>", e.n, rmse, e.nrmse,
+                                e.max_constraint_error_fitted);
+           })
+      .def(pickled<Evaluation>());
 }
 
 // ---------------------------------------------------------------- methods of a posterior

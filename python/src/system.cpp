@@ -14,6 +14,14 @@
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "options.hpp"
+#include "pickles.hpp"
+
+// for pickles
+namespace gp2 {
+
+static auto fields(Finding& of) { return std::tie(of.level, of.text); }
+
+}  // namespace gp2
 
 namespace gp2::python {
 
@@ -47,7 +55,7 @@ py::dict report_of(const DerivedData& derived, const System& system) {
   report["measured"] = named(derived.measured);
   report["completed"] = named(derived.completed);
   report["independent"] = named(derived.independent);
-  report["notes"] = derived.notes;
+  report["notes"] = with_keywords(derived.notes);
   return report;
 }
 
@@ -85,6 +93,7 @@ py::dict parameters_of(const System& system) {
 struct Mechanics {
   py::array M, A, b, F;
 };
+auto fields(Mechanics& of) { return std::tie(of.M, of.A, of.b, of.F); }
 
 // The states of a table by its column names, what the model does not read NaN where there is no column of it.
 py::array states_of_table(const PySystem& self, const py::object& data, const py::object& columns, const char* what) {
@@ -137,7 +146,7 @@ CsvTable resample_table(const PySystem& self, const py::object& data, int n, con
   asked.n = n;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   const Resample chosen = run_or_raise([&](const std::atomic<bool>* stop) { return resample(*self.model, table, asked, stop); });
-  if (chosen.n_skipped > 0) tell({fmt::format("{}: {} rows skipped: a feature has no value", table.name(), chosen.n_skipped)});
+  tell(resample_notes(chosen, table, "chosen"));
   return table.take(chosen.rows);
 }
 
@@ -150,6 +159,7 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const py::o
     asked.stop = stop;
     return derive(*self.model, table, asked);
   });
+  tell(derived.notes);
   return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
 }
 
@@ -243,13 +253,15 @@ void add_mechanics_and_finding(py::module_& module) {
       .def_readonly("M", &Mechanics::M, "Mass matrix (n, nq, nq).")
       .def_readonly("A", &Mechanics::A, "Constraint matrix (n, nc, nq).")
       .def_readonly("b", &Mechanics::b, "Constraint vector (n, nc).")
-      .def_readonly("F", &Mechanics::F, "Known part of the applied force (n, nq) [N or N m].");
+      .def_readonly("F", &Mechanics::F, "Known part of the applied force (n, nq) [N or N m].")
+      .def(pickled<Mechanics>());
 
   py::class_<Finding>(module, "Finding", "One thing a check looked at.")
       .def_property_readonly(
           "level", [](const Finding& finding) { return word(finding.level); }, "'ok', 'warning' or 'error'.")
       .def_readonly("text", &Finding::text, "What was found, and the mend where there is one.")
-      .def("__repr__", [](const Finding& finding) { return fmt::format("{}: {}", word(finding.level), finding.text); });
+      .def("__repr__", [](const Finding& finding) { return fmt::format("{}: {}", word(finding.level), finding.text); })
+      .def(pickled<Finding>());
 }
 
 void define_model_files(py::class_<PySystem>& system) {

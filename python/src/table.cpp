@@ -8,6 +8,7 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2::python {
@@ -48,6 +49,15 @@ CsvTable read_table(const py::object& path, CsvTable::Keep keep) {
   return unlocked([&] { return CsvTable::read(from, keep); });
 }
 
+bool is_path(const py::object& given) { return py::isinstance<py::str>(given) || py::hasattr(given, "__fspath__"); }
+
+// of its own name, or of another one that is given
+CsvTable make_table(const py::object& columns, const std::optional<std::string>& name) {
+  if (name && is_path(columns)) return CsvTable::parse(read_file(path_argument(columns)), *name);
+  CsvTable table = to_table(columns, name.value_or("data"), CsvTable::Keep::text);
+  return !name || *name == table.name() ? table : CsvTable::parse(table.text(), *name);
+}
+
 py::array column_of(const CsvTable& table, const std::string& name) {
   const int column = table.find(name);
   if (column < 0) {
@@ -64,8 +74,7 @@ std::string path_argument(const py::object& path) { return py::bytes(py::module_
 
 CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Keep keep) {
   if (py::isinstance<CsvTable>(data)) return data.cast<CsvTable>();
-  const bool is_path = py::isinstance<py::str>(data) || py::hasattr(data, "__fspath__");
-  if (is_path) return read_table(data, keep);
+  if (is_path(data)) return read_table(data, keep);
   const std::optional<py::list> names = column_names(data);
   if (!names) {
     throw py::type_error(
@@ -87,11 +96,11 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
 
 void add_table(py::module_& module) {
   py::class_<CsvTable>(module, "Table", "Columns by name, as read from a CSV file. A mapping of names to arrays (n,).")
-      .def(py::init(
-               [](const py::object& columns, const std::string& name) { return to_table(columns, name, CsvTable::Keep::text); }),
-           py::arg("columns"), py::arg("name") = "data",
+      .def(py::init(&make_table), py::arg("columns"), py::arg("name") = py::none(),
            "From a frame of pandas or polars, a structured array, a mapping of column names to arrays of one length, say of\n"
-           "scipy.io.loadmat, or the path of a CSV file.")
+           "scipy.io.loadmat, or the path of a CSV file. All numbers become doubles: of whole numbers above 2^53 the last digits "
+           "are\n"
+           "rounded, as in a file. name: default: that of a file or Table, else 'data'.")
       .def_property_readonly("name", &CsvTable::name, "Stands for the table in messages.")
       .def_property_readonly("columns", &CsvTable::header, "Names of the columns, in their order.")
       .def("keys", &CsvTable::header, "Names of the columns, in their order.")

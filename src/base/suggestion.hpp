@@ -20,6 +20,13 @@ inline std::string shortened(std::string_view text, std::size_t max_size = 60) {
   return std::string(text.substr(0, end)) + "...";
 }
 
+/// "1 row", "2 rows", "0 rows".
+/// @param many  the plural where it is not the singular and an s
+template <class Count>
+std::string counted(Count n, std::string_view one, std::string_view many = "") {
+  return n == 1 ? fmt::format("1 {}", one) : many.empty() ? fmt::format("{} {}s", n, one) : fmt::format("{} {}", n, many);
+}
+
 /// Levenshtein distance: the least number of characters inserted, removed or changed between a and b.
 inline std::size_t edit_distance(std::string_view a, std::string_view b) {
   std::vector<std::size_t> row(b.size() + 1);

@@ -102,6 +102,11 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
     throw InputError(fmt::format("{}: the header has {} columns; at most {} are read: split the table, or is it no table?", where,
                                  header.size(), CsvTable::max_columns));
   }
+  const bool is_json = !header.empty() && header[0].starts_with('{');
+  if (is_json || where.find(".toml:") != std::string::npos) {
+    throw InputError(fmt::format("{}: not a table but {}: a CSV log is wanted here", where,
+                                 is_json ? "JSON, as gp2 fit writes it" : "a model file, by its name"));
+  }
   if (header.size() == 1 && header[0].find_first_of(";\t") != std::string::npos) {
     throw InputError(
         fmt::format("{}: the header is not separated by commas but by '{}'; write commas, and '.' as the decimal point", where,

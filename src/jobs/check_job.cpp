@@ -11,6 +11,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
@@ -64,7 +65,6 @@ void check_priors(const System& system, std::vector<Finding>& findings) {
 
 void check_model(const Model& model, std::vector<Finding>& findings) {
   const System& system = *model.system;
-  const auto counted = [](int n, const char* what) { return fmt::format("{} {}{}", n, what, n == 1 ? "" : "s"); };
   findings.push_back({Level::good, fmt::format("{}: '{}', {}, {}", model.name, system.name(), counted(system.nq(), "coordinate"),
                                                counted(system.nc(), "constraint"))});
   check_priors(system, findings);
@@ -352,7 +352,7 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
   const std::string rest = text_of_rest(model, system.parameter_values(), log.states, log.accelerations);
   if (!rest.empty()) findings.push_back({Level::warning, rest});
   check_values(log, system, findings);
-  for (std::string& text : wrong_rates(system, log.states, log.accelerations))
+  for (std::string& text : wrong_rates(system, log.states, log.accelerations, log.reads_time))
     findings.push_back({Level::warning, std::move(text)});
   check_mechanics(model, log.states, findings);
   if (has_error(findings)) return;

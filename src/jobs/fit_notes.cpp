@@ -10,6 +10,7 @@
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "data/evenly.hpp"
 #include "gp2/training/robust.hpp"
 #include "inference/cross_validation.hpp"
 #include "jobs/rate_check.hpp"
@@ -125,19 +126,10 @@ std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, c
   return residuals;
 }
 
-// Where measured accelerations, or the velocities beside them, are not the rates of what they should be.
-void add_rate_notes(const Posterior& posterior, const Observations& of, std::vector<std::string>& notes) {
-  const System& system = *prior_of(posterior.prior(), of.view()).system;
-  MatrixXd accelerations = MatrixXd::Constant(system.nq(), of.n_data(), not_a_number);
-  accelerations(of.view().rows, Eigen::all) = of.values();
-  for (const std::string& text : wrong_rates(system, of.states(), accelerations)) notes.push_back("warning: " + text);
-}
-
 // The accelerations of each log against the constraints.
 void add_constraint_residual_notes(const Posterior& posterior, const JudgedData& judged, std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < judged.observations.size(); ++g) {
     if (!judged.observations[g].view().is_of_ddq()) continue;
-    const std::size_t n_before = notes.size();
     for (ConstraintResidual& one : residuals_to_judge(posterior, judged, g)) {
       if (!one.is_too_large()) continue;
       for (int& state : one.worst) {  // numbers of rows below the header
@@ -146,7 +138,6 @@ void add_constraint_residual_notes(const Posterior& posterior, const JudgedData&
       }
       notes.push_back("warning: " + one.text());
     }
-    if (notes.size() > n_before) add_rate_notes(posterior, judged.observations[g], notes);
   }
 }
 

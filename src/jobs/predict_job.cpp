@@ -232,22 +232,44 @@ std::optional<std::string> note_of_untold(const Posterior& posterior, const Pred
       fmt::join(names, ", "));
 }
 
+namespace {
+
+// Bytes that predictions may take. A small request is never refused, for what is free is not known that well.
+double usable_bytes(std::optional<double> free) {
+  constexpr double share = 0.9, small = 1e8;
+  return free ? std::max(share * *free, small) : HUGE_VAL;
+}
+
+}  // namespace
+
 void require_memory_of_samples(const Posterior& posterior, const View& view, Index n_states, int n_samples,
                                std::optional<double> free) {
-  constexpr double number = 8, name = 64, small = 1e8, share = 0.9;  // bytes; of what is free
+  constexpr double number = 8, name = 64, gigabyte = 1e9;  // bytes
   const auto n = static_cast<double>(n_states);
   double n_latent = 0;
   for (const Latent& latent : posterior.prior().latents) n_latent += n * latent.size();
   // the covariance of the latents and its factor; then, of each sample, latents twice and the view in four places
   const double all = number * 2 * n_latent * n_latent;
   const double one = number * (2 * n_latent + 4 * n * view.size()) + name * view.size();
-  const double bytes = all + n_samples * one;
-  if (!free || bytes <= std::max(share * *free, small)) return;
-  constexpr double gigabyte = 1e9;
-  const double most = std::floor((share * *free - all) / one);
+  const double bytes = all + n_samples * one, usable = usable_bytes(free);
+  if (bytes <= usable) return;
+  const double most = std::floor((usable - all) / one);
   throw InputError(fmt::format(
       "`samples`: {} samples of {} rows together take {:.3g} GB of memory, of which {:.1f} GB are free; {}", n_samples, n_states,
       bytes / gigabyte, *free / gigabyte, most >= 1 ? fmt::format("{:.0f} samples would fit", most) : "take fewer rows"));
+}
+
+void require_memory_of_joint(const Posterior& posterior, const View& view, Index n_states, std::optional<double> free) {
+  constexpr double number = 8, gigabyte = 1e9;  // bytes
+  const auto n = static_cast<double>(n_states), size = n * view.size();
+  // a covariance of each component and one for the caller; of one component the covariance with the training data, twice, and the
+  // kernel between all states
+  const double bytes = number * ((posterior.n_components() + 1) * size * size + 2 * posterior.reduced_size() * size + n * n);
+  if (bytes <= usable_bytes(free)) return;
+  throw InputError(fmt::format(
+      "joint: the covariance of all {} rows takes {:.3g} GB of memory, of which {:.1f} GB are free; take fewer rows, or predict "
+      "the covariance of each row alone",
+      n_states, bytes / gigabyte, *free / gigabyte));
 }
 
 std::vector<Option> options(ViewRequest& request) {

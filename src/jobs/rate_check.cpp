@@ -167,6 +167,14 @@ bool is_scaled(const Steps& steps) {
   return std::abs(s - 1) > std::max(least, by_chance) + 2 * (of_noise + of_trapezoids);
 }
 
+const char* cause_of_factor(double factor) {
+  constexpr double degrees = 180 / std::numbers::pi, near = 0.1;
+  const auto is_near = [&](double one) { return std::abs(factor / one - 1) < near; };
+  if (is_near(-1)) return "a wrong sign";
+  if (is_near(degrees) || is_near(1 / degrees)) return "degrees instead of radians";
+  return "a unit or a sign, or the clock";
+}
+
 // By how much a rate is too large throughout: y = x − o h. Nothing where that does not make it the right one, does not stand out of its
 // deviation, or is less than a tenth of the rate.
 std::optional<double> offset(const Steps& steps) {
@@ -194,7 +202,9 @@ std::string unrelated(const Steps& steps) {
   const Eigen::GeneralizedSelfAdjointEigenSolver<Eigen::Matrix2d> least((next + next.transpose()) / 2, at_once,
                                                                         Eigen::EigenvaluesOnly);
   if (!(least.eigenvalues()[0] > lasting)) return "";
-  return fmt::format("{:.0f} % of what is measured is neither this rate nor noise: another column?", 100 * unexplained);
+  return fmt::format(
+      "{:.0f} % of what is measured is neither this rate nor noise: another column, or a sensor that was stuck for a time?",
+      100 * unexplained);
 }
 
 }  // namespace
@@ -207,7 +217,7 @@ std::string better_rate(const RateColumns& columns) {
   while (columns.t.size() > 2 * length * enough_steps && rows.steps(own, 0, 2 * length).tell(0.5)) length *= 2;
   const Steps now = rows.steps(own, 0, length);
   if (const std::optional<double> o = offset(now)) {
-    return fmt::format("what is measured lies {:.3g} {} it throughout: a sensor offset, or measured gravity", std::abs(*o),
+    return fmt::format("the column lies {:.3g} {} it throughout: a sensor offset, or measured gravity", std::abs(*o),
                        *o > 0 ? "above" : "below");
   }
   if (!now.tell(1)) return "";
@@ -243,7 +253,7 @@ std::string better_rate(const RateColumns& columns) {
     const double tau = static_cast<double>(*lag) * rows.usual_length() + lateness(steps, 0.75 * rows.usual_length()).value_or(0);
     std::vector<std::string> texts;
     if (is_scaled(steps))
-      texts.push_back(fmt::format("it is {:.3g} × what is measured: a unit or a sign, or the clock", steps.slope()));
+      texts.push_back(fmt::format("the rate is {:.3g} × the column: {}", steps.slope(), cause_of_factor(steps.slope())));
     if (tau != 0) {
       texts.push_back(fmt::format("the column {} by {:.2g} s, {:.2g} of the log's steps, or {} {}", tau > 0 ? "lags" : "leads",
                                   std::abs(tau), std::abs(tau) / rows.usual_length(), columns.name, tau > 0 ? "leads" : "lags"));
@@ -254,12 +264,14 @@ std::string better_rate(const RateColumns& columns) {
   return other.empty() ? unrelated(now) : other;
 }
 
-std::vector<std::string> wrong_rates(const System& system, const Ref<const MatrixXd>& states,
-                                     const Ref<const MatrixXd>& accelerations) {
+namespace {
+
+std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, const System& system,
+                                          const Ref<const MatrixXd>& states, const Ref<const MatrixXd>& accelerations) {
   const StateLayout layout = system.layout();
   constexpr Index fewest = 30, enough = 300'000;
   const Index n = std::min(states.cols(), enough);
-  const RowVectorXd t = states.row(layout.t()).head(n);
+  const RowVectorXd t = times.head(n);
   if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return {};
   std::vector<RowVectorXd> q, dq, ddq;
   std::vector<std::string> velocities;
@@ -282,6 +294,21 @@ std::vector<std::string> wrong_rates(const System& system, const Ref<const Matri
     // a velocity that is wrong says nothing of the acceleration
     if (!add_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
       add_if_wrong({t, velocities[j], dq[j], false, ddq, acceleration_names, j});
+  }
+  return notes;
+}
+
+}  // namespace
+
+std::vector<std::string> wrong_rates(const System& system, const Ref<const MatrixXd>& states,
+                                     const Ref<const MatrixXd>& accelerations, bool reads_time) {
+  RowVectorXd t = states.row(system.layout().t());
+  std::vector<std::string> notes = wrong_rates_over(t, system, states, accelerations);
+  const int n_smaller_units = reads_time ? 0 : 3;
+  for (int unit = 0; unit < n_smaller_units && !notes.empty(); ++unit) {
+    t *= 1e-3;
+    std::vector<std::string> others = wrong_rates_over(t, system, states, accelerations);
+    if (others.size() < notes.size()) notes = std::move(others);
   }
   return notes;
 }

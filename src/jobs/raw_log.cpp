@@ -316,12 +316,11 @@ void RawLog::split_at_pauses() {
 bool RawLog::moves(const Episode& part) const {
   return std::all_of(measured_.begin(), measured_.end(), [&](int j) {
     std::size_t n = 0;
-    std::set<std::string> values;
+    std::set<double> values;
     for (const int row : part.rows) {
-      const std::string cell = log_.cell(row, position_column_.at(j));
-      if (is_missing(cell)) continue;
+      if (is_missing(log_.cell(row, position_column_.at(j)))) continue;
       ++n;
-      if (values.size() < 2) values.insert(cell);
+      if (values.size() < 2) values.insert(log_.number(row, position_column_.at(j)));
     }
     return n >= least_rows && values.size() > 1;
   });

@@ -21,6 +21,7 @@
 #include "gp2/simulation/projected_states.hpp"
 #include "inference/inverse_dynamics.hpp"
 #include "jobs/observation_noise.hpp"
+#include "jobs/rate_check.hpp"
 
 namespace gp2 {
 
@@ -134,7 +135,7 @@ std::optional<CommandedRows> of_rows(std::optional<CommandedRows> commanded, con
   return commanded;
 }
 
-std::vector<int> counted(Index n) {
+std::vector<int> all_rows(Index n) {
   std::vector<int> numbers(static_cast<std::size_t>(n));
   std::iota(numbers.begin(), numbers.end(), 0);
   return numbers;
@@ -170,7 +171,7 @@ std::vector<int> measured_rows(Readings& readings, const std::vector<std::string
     missing.push_back(fmt::format("{} of {} of {}{}", n, log.n_rows(), names[static_cast<std::size_t>(k)],
                                   n_without > 0 ? fmt::format(" ({} without a standard deviation)", n_without) : ""));
   }
-  if (missing.empty()) return counted(log.n_rows());
+  if (missing.empty()) return all_rows(log.n_rows());
   notes.push_back(fmt::format("{}: values not measured (empty cells): {}", log.name(), fmt::join(missing, ", ")));
   std::vector<int> rows;
   for (int i = 0; i < log.n_rows(); ++i) {
@@ -285,7 +286,7 @@ std::vector<std::string> observed_accelerations(const System& system, const FitP
   // of accelerations that are independent here or there a choice of rows may have none
   const auto is_empty = [&](const std::string& name) {
     const int column = log.find(reader.stddev_column(name));
-    return std::ranges::all_of(counted(log.n_rows()), [&](int row) { return log.is_empty(row, column); });
+    return std::ranges::all_of(all_rows(log.n_rows()), [&](int row) { return log.is_empty(row, column); });
   };
   if (!std::all_of(stated.begin(), stated.end(), is_empty)) std::erase_if(stated, is_empty);
   if (!stated.empty() && stated.size() < system.coordinates().size()) {
@@ -352,6 +353,47 @@ void note_rest(const LoggedSystem& logged, const Readings& readings, const CsvTa
   if (logged.other) return;
   const std::string text = text_of_rest(logged.model, logged.parameters, readings.states, readings.values);
   if (!text.empty()) notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
+}
+
+// What a log measures of a motion, of which a fit need not read all.
+struct LoggedMotion {
+  MatrixXd states, accelerations;
+};
+
+// Nothing without a time, or if columns hold other things than numbers, which a fit that does not read them accepts.
+std::optional<LoggedMotion> read_motion(const System& system, const CsvTable& log,
+                                        const std::map<std::string, std::string>& columns) {
+  LogReader reader(log, system, columns);
+  if (!reader.has("t")) return std::nullopt;
+  const std::vector<std::string> names = system.state_names();
+  std::vector<bool> reads(names.size());
+  for (int row = 0; row <= system.layout().t(); ++row) {
+    const auto k = static_cast<std::size_t>(row);
+    reads[k] = reader.has(names[k]);
+  }
+  try {
+    LoggedMotion motion{reader.states_with_gaps(reads), {}};
+    motion.accelerations = MatrixXd::Constant(system.nq(), motion.states.cols(), not_a_number);
+    Index row = 0;
+    for (const std::string& name : system.acceleration_names()) {
+      if (has_values(reader, log, name)) motion.accelerations.row(row) = reader.measurements({name});
+      ++row;
+    }
+    return motion;
+  } catch (const InputError&) {
+    return std::nullopt;
+  }
+}
+
+// Columns that are not the rates of what they should be over the log's time, whether or not the model reads that.
+void note_rates(const LoggedSystem& logged, const CsvTable& log, const std::map<std::string, std::string>& columns,
+                std::vector<std::string>& notes) {
+  const System& system = logged.system();
+  const std::optional<LoggedMotion> motion = read_motion(system, log, columns);
+  if (!motion) return;
+  const bool reads_time = logged.prior.reads()[static_cast<std::size_t>(system.layout().t())];
+  for (const std::string& text : wrong_rates(system, motion->states, motion->accelerations, reads_time))
+    notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
 }
 
 // the rows of a view whose columns are there
@@ -575,6 +617,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   note_violation(system, readings.states, logged.parameters, log.table, notes, &options);
   note_repeats(readings, log.table, notes);
   note_rest(logged, readings, log.table, notes);
+  if (!log.windows) note_rates(logged, log.table, columns, notes);
 
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
@@ -834,10 +877,12 @@ std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Mo
 
 WholeLog read_whole_log(const Model& model, LogReader& reader) {
   const System& system = *model.system;
-  std::vector<bool> reads = make_prior(model).reads();
+  const std::vector<bool> prior_reads = make_prior(model).reads();
+  std::vector<bool> reads = prior_reads;
   const std::vector<std::string> names = system.state_names();
   for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
   WholeLog log;
+  log.reads_time = prior_reads[static_cast<std::size_t>(system.layout().t())];
   log.states = reader.states(reads);
   std::vector<std::string> notes;
   take_commands(system, model.actuators, reader, std::nullopt, {}, log.states, notes);

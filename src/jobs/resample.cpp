@@ -6,9 +6,11 @@
 #include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "base/random.hpp"
 #include "base/stop.hpp"
+#include "base/suggestion.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -160,6 +162,22 @@ Resample resample(const Model& model, const CsvTable& log, const ResampleOptions
   Resample out{{}, std::move(farthest.distance), farthest.radius, std::move(features.names), log.n_rows() - n_usable};
   for (const int chosen : farthest.chosen) out.rows.push_back(usable[static_cast<std::size_t>(chosen)]);
   return out;
+}
+
+std::vector<std::string> resample_notes(const Resample& chosen, const CsvTable& log, const std::string& name) {
+  std::vector<std::string> notes;
+  if (chosen.n_skipped > 0) {
+    notes.push_back(fmt::format("{}: {} skipped: a feature has no value", log.name(), counted(chosen.n_skipped, "row")));
+  }
+  notes.push_back(fmt::format("distances are in {}, each divided by its standard deviation", fmt::join(chosen.features, ", ")));
+  notes.push_back(fmt::format("{}: {} of {} rows; every other row is within {:.3g} of one of them", name, chosen.rows.size(),
+                              log.n_rows(), chosen.radius));
+  const auto n_repeating = (chosen.distance.array() == 0).count() - 1;  // the first has none before it
+  if (n_repeating > 0) {
+    notes.push_back(
+        fmt::format("the last {} rows repeat those before them in every feature: fewer cover the log as well", n_repeating));
+  }
+  return notes;
 }
 
 }  // namespace gp2

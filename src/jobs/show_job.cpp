@@ -8,6 +8,7 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "gp2/training/laplace.hpp"
 
@@ -181,8 +182,8 @@ std::string latents_text(const Model& model, bool full) {
 
 std::string whole_text(const Model& model, const SymbolicSystem& system, bool full) {
   const Derived derived(system);
-  std::string text = fmt::format("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(),
-                                 system.inputs().size(), system.nc());
+  std::string text = fmt::format("{}\n  {}, {}, {}\n", system.name(), counted(system.nq(), "coordinate"),
+                                 counted(system.inputs().size(), "input"), counted(system.nc(), "constraint"));
   if (model.robot) text += robot_text(*model.robot);
   text += units_text(model, system);
   text += fmt::format("\nmass matrix M\n{}", matrix_text(derived.M, full));
@@ -328,8 +329,8 @@ std::string text_of(const FitReport& report, const Model& model) {
   text += std::abs(nll) < 1e9 ? fmt::format("{:.6f}\n", nll) : fmt::format("{:.6g}\n", nll);
   text += report.restarts.empty()
               ? fmt::format("{}: a checkpoint of a fit in progress", report.termination)
-              : fmt::format("{} after {} iterations ({} restart{}, best: {})", report.termination, report.iterations,
-                            report.restarts.size(), report.restarts.size() == 1 ? "" : "s", report.best_restart + 1);
+              : fmt::format("{} after {} ({}, best: {})", report.termination, counted(report.iterations, "iteration"),
+                            counted(report.restarts.size(), "restart"), report.best_restart + 1);
   text += report.seconds > 0 ? fmt::format(", {:.2f} s\n", report.seconds) : "\n";  // no file holds how long it took
   if (report.draws) text += draws_text(report);
   for (const ActuatorEstimate& one : report.actuators) {

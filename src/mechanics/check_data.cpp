@@ -3,6 +3,7 @@
 #include <functional>
 #include <limits>
 #include <numeric>
+#include <ranges>
 #include <utility>
 
 #include <fmt/format.h>
@@ -193,6 +194,78 @@ void check_contacts(const SymbolicSystem& system, const Ref<const MatrixXd>& sta
   }
 }
 
+// r = A ddq − b of one row of A at one state.
+struct StateResidual {
+  int state = 0;
+  double r = 0;
+  double size = 0;      // of the terms that should cancel
+  double variance = 0;  // of r, by the noise; NaN where it is not known
+
+  [[nodiscard]] double distance() const { return std::abs(r) / (std::isfinite(variance) ? std::sqrt(variance) : 1); }
+  [[nodiscard]] bool operator>(const StateResidual& other) const {
+    return std::pair(distance(), state) > std::pair(other.distance(), other.state);
+  }
+};
+
+// Those of one row of A at all states. The farthest are kept apart, so that the rest without them can be judged.
+class RowResiduals {
+ public:
+  explicit RowResiduals(Index n_states)
+      : most_kept_(std::max<std::size_t>(n_worst, static_cast<std::size_t>(n_states) / one_in)) {}
+
+  void add(const StateResidual& one) {
+    farthest_.push_back(one);
+    std::ranges::push_heap(farthest_, std::greater());
+    if (farthest_.size() <= most_kept_) return;
+    std::ranges::pop_heap(farthest_, std::greater());
+    add_to_sums(farthest_.back());
+    farthest_.pop_back();
+  }
+
+  /// Of all states.
+  [[nodiscard]] ConstraintResidual summary() && {
+    std::ranges::sort(farthest_, std::greater());
+    const std::size_t most_outliers = (static_cast<std::size_t>(sums_.n) + farthest_.size()) / one_in;
+    std::vector<ConstraintResidual> without_first{means()};  // without all of the farthest, …, without none
+    for (const StateResidual& one : std::views::reverse(farthest_)) {
+      add_to_sums(one);
+      without_first.push_back(means());
+    }
+    ConstraintResidual all = without_first.back();
+    for (std::size_t k = 0; k < std::min(n_worst, farthest_.size()); ++k) all.worst.push_back(farthest_[k].state);
+    for (std::size_t k = 1; k <= most_outliers && all.is_too_large(); ++k) {
+      const ConstraintResidual& rest = without_first[farthest_.size() - k];
+      // a residual that grows with some quantity loses less with its largest values
+      if (rest.is_too_large() || rest.rms > 0.5 * all.rms) continue;
+      all.n_outliers = static_cast<int>(k);
+      break;
+    }
+    return all;
+  }
+
+ private:
+  void add_to_sums(const StateResidual& one) {
+    ++sums_.n;
+    sums_.rms += one.r * one.r;
+    sums_.mean += one.r;
+    sums_.size += one.size * one.size;
+    sums_.expected += one.variance;
+  }
+
+  [[nodiscard]] ConstraintResidual means() const {
+    ConstraintResidual means = sums_;
+    if (means.n == 0) return means;
+    means.mean /= means.n;
+    for (double* const square : {&means.rms, &means.size, &means.expected}) *square = std::sqrt(*square / means.n);
+    return means;
+  }
+
+  static constexpr std::size_t n_worst = 3, one_in = 20;
+  std::size_t most_kept_;
+  std::vector<StateResidual> farthest_;  // a heap whose first is the least far
+  ConstraintResidual sums_;              // of the others; squares where a root mean square is wanted
+};
+
 }  // namespace
 
 std::vector<ConstraintViolation> constraint_violations(const System& system, const Ref<const MatrixXd>& states,
@@ -324,6 +397,14 @@ std::string ConstraintResidual::text() const {
   }
   std::vector<int> rows;
   for (const int state : worst) rows.push_back(state + 1);
+  if (n_outliers > 0) {
+    rows.resize(std::min(rows.size(), static_cast<std::size_t>(n_outliers)));
+    return fmt::format(
+        "measured ddq on A ddq = b: rms residual {:.3g} for '{}' is more than noise, but only because of {} of {} rows (farthest "
+        "off: row {}): outliers of the log, or an event that the model lacks, such as a collision; correct or leave out these "
+        "rows, or give them less weight by a fit with `robust`",
+        rms, constraint, n_outliers, n, fmt::join(rows, ", "));
+  }
   if (!is_known) {
     return fmt::format(
         "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, is more than noise: a constraint, a "
@@ -341,50 +422,33 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
                                                      const Ref<const VectorXd>& parameters,
                                                      const Ref<const MatrixXd>& accelerations,
                                                      const Ref<const MatrixXd>& stddev) {
-  constexpr std::size_t n_worst = 3;
-  using Distances = std::vector<std::pair<double, int>>;  // of the worst states, the largest first
-  std::vector<ConstraintResidual> all(static_cast<std::size_t>(system.nc()));
-  std::vector<Distances> distances(all.size());
+  std::vector<RowResiduals> rows(static_cast<std::size_t>(system.nc()), RowResiduals(states.cols()));
   in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
     const SystemValues values = system.evaluate(block, parameters);
     for (int row = 0; row < system.nc(); ++row) {
-      ConstraintResidual& one = all[static_cast<std::size_t>(row)];
-      Distances& worst = distances[static_cast<std::size_t>(row)];
       for (int i = 0; i < values.n_states(); ++i) {
         const Index state = first + i;
-        double r = -values.b(i)[row], size = std::abs(r), variance = 0;
+        StateResidual one{static_cast<int>(state), -values.b(i)[row], std::abs(values.b(i)[row])};
         for (int j = 0; j < system.nq(); ++j) {
           const double a = values.A(i)(row, j);
           if (a == 0) continue;
-          r += a * accelerations(j, state);
-          size += std::abs(a * accelerations(j, state));
-          variance += a * a * stddev(j, state) * stddev(j, state);
+          one.r += a * accelerations(j, state);
+          one.size += std::abs(a * accelerations(j, state));
+          one.variance += a * a * stddev(j, state) * stddev(j, state);
         }
         // a row that vanishes says nothing of ddq
-        if (!std::isfinite(r) || variance == 0) continue;
-        variance += std::pow(system.constraint_noise()[row], 2);
-        ++one.n;
-        one.rms += r * r;
-        one.mean += r;
-        one.size += size * size;
-        one.expected += variance;
-        const std::pair distance(std::isfinite(variance) ? std::abs(r) / std::sqrt(variance) : std::abs(r),
-                                 static_cast<int>(state));
-        if (worst.size() == n_worst && distance < worst.back()) continue;
-        worst.insert(std::upper_bound(worst.begin(), worst.end(), distance, std::greater<>()), distance);
-        worst.resize(std::min(worst.size(), n_worst));
+        if (!std::isfinite(one.r) || one.variance == 0) continue;
+        one.variance += std::pow(system.constraint_noise()[row], 2);
+        rows[static_cast<std::size_t>(row)].add(one);
       }
     }
   });
-  for (std::size_t row = 0; row < all.size(); ++row) {
-    ConstraintResidual& one = all[row];
+  std::vector<ConstraintResidual> all;
+  for (std::size_t row = 0; row < rows.size(); ++row) {
+    ConstraintResidual one = std::move(rows[row]).summary();
     one.constraint = system.constraint_labels()[row];
-    if (one.n == 0) continue;
-    one.mean /= one.n;
-    for (double* const square : {&one.rms, &one.size, &one.expected}) *square = std::sqrt(*square / one.n);
-    for (const auto& [distance, state] : distances[row]) one.worst.push_back(state);
+    if (one.n > 0) all.push_back(std::move(one));
   }
-  std::erase_if(all, [](const ConstraintResidual& one) { return one.n == 0; });
   return all;
 }
 
@@ -411,7 +475,7 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
                                       estimates_noise ? Ref<const MatrixXd>(told) : Ref<const MatrixXd>(stddev));
   for (const ConstraintResidual& one : constraint_residuals(system, states, parameters, accelerations, stddev)) {
     // as large as what should cancel: nothing that is learned from such data is of this system
-    const bool is_all = one.is_too_large() && one.rms > 0.3 * one.size && !estimates;
+    const bool is_all = one.is_too_large() && one.n_outliers == 0 && one.rms > 0.3 * one.size && !estimates;
     std::string text = one.text();
     if (one.is_too_large() && estimates) text += "; here with the parameters as in the model file";
     if (one.is_too_small() && !rows && !estimates_noise) {
@@ -433,13 +497,15 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
   if (rows && !stated.empty() && most_stated() <= std::ssize(*rows)) {
     findings.push_back(
         {Level::good,
-         fmt::format("dependent columns: the {} accelerations obey A ddq = b, or a part of it, far better than noise "
-                     "lets them; a fit observes {}, whose deviations the log gives",
-                     system.nq(), fmt::join(names_of(stated), ", "))});
+         fmt::format(
+             "dependent columns: the {} accelerations satisfy A ddq = b, or part of it, far more closely than measurement "
+             "noise allows; a fit observes {}, whose standard deviations the log gives",
+             system.nq(), fmt::join(names_of(stated), ", "))});
   } else if (rows) {
     findings.push_back(
-        {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b, or a part of it, far better than "
-                                     "noise lets them, so only {} of them are independent measurements: fit with `observe={}`",
+        {Level::warning, fmt::format("dependent columns: the {} accelerations satisfy A ddq = b, or part of it, far more closely "
+                                     "than measurement noise allows, so only {} of them are independent measurements: fit with "
+                                     "`observe={}`",
                                      system.nq(), rows->size(), fmt::join(names_of(*rows), ","))});
   }
   return findings;

@@ -58,16 +58,18 @@ Model Model::parse(std::string text, std::string name, const RobotSource& robot,
   if (model.text.size() > max_model_size) {
     throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", model.name, model.text.size(), max_model_size));
   }
+  const auto not_toml = [&](const char* kind) {
+    throw InputError(fmt::format("{}: not valid TOML but {}: a model file is wanted here", model.name, kind));
+  };
   const std::size_t first = model.text.find_first_not_of(" \t\r\n");
-  if (first != std::string::npos && model.text[first] == '{') {
-    throw InputError(fmt::format("{}: not valid TOML but JSON, as gp2 fit writes it: a model file is wanted here", model.name));
-  }
+  if (first != std::string::npos && model.text[first] == '{') not_toml("JSON, as gp2 fit writes it");
   try {
     const internal::StepLimit limit;
     require_safe(model.text, model.name);
     const toml::table root = toml::parse(model.text, model.name);
     read_model(root, robot, model);
   } catch (const toml::parse_error& error) {
+    if (model.name.ends_with(".csv")) not_toml("a table, by its name");
     throw InputError(fmt::format("{}:{}: not valid TOML: {}", model.name, error.source().begin.line, error.description()));
   } catch (const LocatedError&) {
     throw;

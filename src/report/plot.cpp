@@ -105,27 +105,30 @@ std::string path_of(const VectorXd& x, const VectorXd& y, const Axis& across, co
 
 std::vector<Option> options(PlotRequest& request) {
   return {
-      {"what", &request.what, "LATENT", "latent whose force is drawn", "what the data determine best"},
-      {"along", &request.along, "NAME", "entry of the state along which, all others as in the most usual row",
-       "the one that changes it most"},
+      {"what", &request.what, "LATENT", "latent whose force is plotted", "the force that the data determine best"},
+      {"along", &request.along, "NAME",
+       "state variable on the horizontal axis; all others have their values in the most typical row of the training data",
+       "the variable along which the force changes most"},
       {"force", &request.force, "COORDINATE",
-       "coordinate on which the force acts, or `coefficient`, of friction that knows its load", "what the data determine best"},
+       "coordinate on which the force acts; `force=coefficient` plots the coefficient of load-dependent friction",
+       "the force that the data determine best"},
   };
 }
 
 LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& request) {
-  if (posterior.prior().reference) throw InputError("nothing to draw: a baseline learns accelerations, and no force");
+  if (posterior.prior().reference) throw InputError("nothing to plot: a baseline learns accelerations, not forces");
   std::vector<LearnedCurve> curves;
   for (const LearnedForce& one : learned_forces(posterior)) {
     const double largest = one.mean.cwiseAbs().maxCoeff() + one.stddev.maxCoeff();
     for (Index row = 0; row < one.mean.rows(); ++row) {
-      // a coordinate that the latent does not act on has no picture
+      // coordinates that the latent does not act on are left out
       const double size = one.mean.row(row).cwiseAbs().maxCoeff() + one.stddev.row(row).maxCoeff();
       if (size > 1e-12 * largest) curves.push_back({one, row});
     }
   }
   if (curves.empty()) {
-    throw InputError("nothing to draw: no latent of the fit reads what changes in the training data of its own system");
+    throw InputError(
+        "nothing to plot: no latent of the fit depends on a variable that changes in the training data of its own system");
   }
   keep(curves, "`what`", request.what, [](const LearnedCurve& one) { return one.force.latent; });
   keep(curves, "`force`", request.force,

@@ -404,8 +404,10 @@ class Training {
     if (options_.progress) {
       const std::scoped_lock lock(mutex_);
       best_ = std::min(best_, value);
-      // few runs take more than some hundred iterations; the estimate of what is left need not be better than that
-      fractions_[static_cast<std::size_t>(restart)] = iteration / (iteration + 100.0);
+      // few runs take more than some hundred iterations; at an even pace the time that is left falls from the first on, and it does
+      // not rise again where a run begins anew from an optimum
+      double& of_run = fractions_[static_cast<std::size_t>(restart)];
+      of_run = std::max(of_run, 1 - std::exp(-iteration / 100.0));
       double done = 0;
       for (double fraction : fractions_) done += fraction;
       const double fraction = share_of_restarts() * done / std::max(n_own_, 1);

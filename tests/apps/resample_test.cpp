@@ -53,7 +53,7 @@ TEST(ResampleCommand, LeavesCellsAsTheyAreAndSkipsGaps) {
              "coordinates = [\"x\"]\n[mechanics]\nmass = [[\"1\"]]\n[[latent]]\nname = \"f\"\nkernel = \"se\"\n"
              "features = [\"x\"]\ndirections = \"acceleration\"\n");
   const Outcome outcome = desk.done("gp2 resample log.csv --model model.toml --map place=x -n 2 -o subset.csv");
-  EXPECT_TRUE(outcome.said("log.csv: 1 rows skipped: a feature has no value"));
+  EXPECT_TRUE(outcome.said("log.csv: 1 row skipped: a feature has no value"));
   EXPECT_EQ(desk.read("subset.csv"), "t,remark,place\n0,\"a, \"\"b\"\"\",1.50\n2,c,+2e0\n");
 }
 

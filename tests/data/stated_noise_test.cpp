@@ -289,11 +289,9 @@ TEST(StatedNoise, TellsACheckWhichAccelerationsAreMeasured) {
     }
     return out;
   };
-  EXPECT_THAT(
-      texts({"ddx_std"}),
-      Contains(
-          "good: dependent columns: the 2 accelerations obey A ddq = b, or a part of it, far better than noise lets them; a fit "
-          "observes ddx, whose deviations the log gives"));
+  EXPECT_THAT(texts({"ddx_std"}), Contains("good: dependent columns: the 2 accelerations satisfy A ddq = b, or part of it, far "
+                                           "more closely than measurement noise "
+                                           "allows; a fit observes ddx, whose standard deviations the log gives"));
   EXPECT_THAT(texts({"ddx_std"}), Not(Contains(HasSubstr("not good"))));
   EXPECT_THAT(texts({}), Contains(HasSubstr("not good: dependent columns")));
   EXPECT_THAT(texts({"ddx_std", "ddy_std"}), Contains(HasSubstr("not good: dependent columns")));

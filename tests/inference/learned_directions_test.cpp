@@ -64,8 +64,7 @@ Learned learned(const Case& c) {
   Learned p{make_prior(model), {}, {}};
   for (Latent& latent : p.prior.latents) latent.free_loading = 1 + latent.size();  // [W, diag √κ] of one column W
   for (const View& view : c.views) {
-    MatrixXd states(model.system->layout().size(), n_data);
-    for (double& entry : states.reshaped()) entry = random.normal();
+    const MatrixXd states = test::random_matrix(model.system->layout().size(), n_data, random);
     p.observations.push_back(test::observe(model, view, states, random));
   }
   p.values = test::random_values(p.prior, p.observations, random);

@@ -179,9 +179,7 @@ TEST(LikelihoodGradientTest, MatchesDifferencesThroughInducingPoints) {
 // every latent acts nonlinearly there, about signals that are not those of a posterior
 TEST(LikelihoodGradientTest, MatchesDifferencesWhereAPriorIsMadeLinear) {
   for (const Model& model : {test::model_that_rubs(), test::model_that_rubs_softly()}) {
-    PriorOptions options;
-    options.mean = Prior::Mean::force;
-    Problem p{model.name, make_prior(model, options), {}, {}, {}, {}};
+    Problem p{model.name, make_prior(model, {Prior::Mean::force, std::nullopt}), {}, {}, {}, {}};
     RandomStream random(likelihood_gradient_seed);
     const MatrixXd states = test::draw(model, 9, likelihood_gradient_seed).states;
     for (const View& view : {View::constrained_acceleration(*model.system), View::constraint_force(*model.system)}) {

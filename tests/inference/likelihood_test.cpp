@@ -69,8 +69,7 @@ TEST(LikelihoodTest, OfAConstraintThatComesAndGoesIsThatOfTheModelWithItOrWithou
     // the load of a row that is not there is that of none
     const Model switched = test::model_with_contacts();
     RandomStream random(likelihood_seed);
-    MatrixXd states(switched.system->layout().size(), 12);
-    for (double& entry : states.reshaped()) entry = random.normal();
+    MatrixXd states = test::random_matrix(switched.system->layout().size(), 12, random);
     states.bottomRows(1).setConstant(is_active ? 1 : 0);
     const auto likelihood = [&](const Model& model) {
       RandomStream draws(likelihood_seed + 1);
@@ -112,10 +111,8 @@ TEST(LikelihoodTest, FactorsOneRowPerFreeDirectionThatIsSeen) {
 TEST(LikelihoodTest, ARowThatSaysNothingNewChangesNothing) {
   const std::string text = test::model("models/surface.toml").text;
   const std::string row = R"("p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3")";
-  std::string doubled_text = text;
-  doubled_text.replace(doubled_text.find(row), row.size(),
-                       row + ",\n  \"10*(p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3)\"");
-  const Model doubled = Model::parse(doubled_text, "surface with a row twice");
+  const std::string again = row + ",\n  \"10*(p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3)\"";
+  const Model doubled = Model::parse(test::changed(text, {{row, again}}), "surface with a row twice");
   ASSERT_EQ(doubled.system->nc(), 2);
   Likelihood::Options options;
   options.gradient_parameters = {2, 3};

@@ -111,9 +111,7 @@ TEST(Multipliers, AreFoundWhereTheLoadIsAboutToChangeItsSign) {
 }
 
 TEST(Multipliers, ThatGrowFasterThanTheForceTheyNeedAreAnErrorThatNamesTheState) {
-  std::string text = rubbing_bead("lambda").text;
-  text.replace(text.find("\"0.3\""), 5, "\"30\"");
-  const Model model = Model::parse(text, "bead");
+  const Model model = Model::parse(test::changed(rubbing_bead("lambda").text, {{"\"0.3\"", "\"30\""}}), "bead");
   const MatrixXd states = test::draw(rubbing_bead("lambda"), 20, nonlinear_seed).states;
   expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"Painlevé", "x = "});
 }
@@ -136,9 +134,8 @@ TEST(Multipliers, ThatOneSampleMakesGrowTooFastAreAnErrorThatNamesTheSample) {
 }
 
 TEST(Multipliers, ThatGiveNoFiniteForceAreAnErrorOfTheirOwn) {
-  std::string text = rubbing_bead("lambda").text;
-  text.replace(text.find("abs(lambda(1))"), 14, "sqrt(-lambda(1) - 100)");
-  const Model model = Model::parse(text, "bead");
+  const Model model =
+      Model::parse(test::changed(rubbing_bead("lambda").text, {{"abs(lambda(1))", "sqrt(-lambda(1) - 100)"}}), "bead");
   const MatrixXd states = test::draw(rubbing_bead("lambda"), 3, nonlinear_seed).states;
   expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"not a finite number", "x = "});
 }
@@ -193,11 +190,7 @@ TEST(CheckOfALoad, WarnsOfARowWhoseShareOfItNothingTells) {
 struct Rubs {
   Model model;
   explicit Rubs(Model of = test::model_that_rubs()) : model(std::move(of)) {}
-  Prior prior = [&] {
-    PriorOptions options;
-    options.mean = Prior::Mean::force;
-    return make_prior(model, options);
-  }();
+  Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   MatrixXd states = test::draw(model, 6, nonlinear_seed).states;
   VectorXd parameters = model.system->parameter_values();
   MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, parameters);
@@ -334,9 +327,7 @@ TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
     const std::string hard = rubbing_bead("lambda", "constant", is_positive ? "positive = true" : "").text,
                       soft = "[{ expr = \"z - h*x^2\", noise = 0.6 }]";
     const Model model = Model::parse(is_soft ? test::changed(hard, {{"[\"z - h*x^2\"]", soft}}) : hard, "bead");
-    PriorOptions options;
-    options.mean = Prior::Mean::force;
-    const Prior prior = make_prior(model, options);
+    const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
     const MatrixXd states = test::draw(model, 25, nonlinear_seed).states;
     const View view = View::constrained_acceleration(*model.system);
     const double sigma = 0.2, s = is_positive ? 1.1 : 0.4;
@@ -421,9 +412,7 @@ kernel     = "constant"
 features   = ["v"]
 directions = { force = [["0"], ["1"]] }
 )toml");
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   View ddx = View::constrained_acceleration(*model.system);
   ddx.rows = {0};
   VectorXd bottom = VectorXd::Zero(model.system->layout().size());
@@ -448,27 +437,32 @@ directions = { force = [["0"], ["1"]] }
   }
 }
 
+// the accelerations of n drawn states with noise
+Observations measured(const Model& model, int n, std::uint64_t seed, double noise) {
+  const MatrixXd states = test::draw(model, n, seed).states;
+  MatrixXd y = ModelMotion(model).acceleration(states);
+  RandomStream random(seed);
+  for (double& one : y.reshaped()) one += noise * random.normal();
+  return {states, View::constrained_acceleration(*model.system), y, VectorXd::Constant(model.system->nq(), noise)};
+}
+
 struct Fitted {
   Model model;
   Prior prior;
   std::vector<Observations> observations;
-  explicit Fitted(Model of, int n) : model(std::move(of)) {
-    PriorOptions options;
-    options.mean = Prior::Mean::force;
-    prior = make_prior(model, options);
-    RandomStream random(nonlinear_seed);
-    const MatrixXd states = test::draw(model, n, nonlinear_seed).states;
-    MatrixXd y = ModelMotion(model).acceleration(states);
-    for (double& one : y.reshaped()) one += 0.01 * random.normal();
-    observations.push_back(
-        {states, View::constrained_acceleration(*model.system), y, VectorXd::Constant(model.system->nq(), 0.01)});
-  }
+  explicit Fitted(Model of, int n)
+      : model(std::move(of)),
+        prior(make_prior(model, {Prior::Mean::force, std::nullopt})),
+        observations{measured(model, n, nonlinear_seed, 0.01)} {}
+  [[nodiscard]] std::vector<Hyperparameter> start() const { return default_hyperparameters(prior, observations, {}, {}); }
+  [[nodiscard]] ModelValues values() const { return model_values(prior, observations, start()); }
+  [[nodiscard]] Posterior posterior() const { return Posterior(prior, observations, values()); }
+  [[nodiscard]] Fit fit(const FitOptions& options = {}) const { return gp2::fit(prior, observations, start(), options); }
 };
 
 TEST(NonlinearPosterior, MeansSamplesAndPathsHoldTheConstraintsAndTheFixedPoint) {
   const Fitted fitted(test::model_that_rubs(), 25);
-  ModelValues values =
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+  ModelValues values = fitted.values();
   const Posterior posterior(fitted.prior, fitted.observations, values);
   const MatrixXd states = test::draw(fitted.model, 15, nonlinear_seed + 1).states;
   const System& system = *fitted.model.system;
@@ -523,9 +517,7 @@ TEST(NonlinearPredictor, IsThePosteriorWithItsJacobianAndAllocatesNothing) {
   for (const Fitted& fitted : {Fitted(test::model_that_rubs(), 25), Fitted(rubbing_bead("lambda", "se + constant"), 25),
                                Fitted(rubbing_bead("lambda0", "se + constant", "positive = true"), 25)}) {
     SCOPED_TRACE(fitted.model.text);
-    const Posterior posterior(
-        fitted.prior, fitted.observations,
-        model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+    const Posterior posterior = fitted.posterior();
     const MatrixXd states = test::draw(fitted.model, 12, nonlinear_seed + 1).states;
     const System& system = *fitted.model.system;
     for (const View& view :
@@ -566,9 +558,7 @@ TEST(NonlinearPredictor, IsThePosteriorWithItsJacobianAndAllocatesNothing) {
 TEST(NonlinearInverseDynamics, FindsInputsWhoseForceChangesTheFriction) {
   for (const Fitted& fitted : {Fitted(test::model_that_rubs(), 25), Fitted(rubbing_bead("lambda", "se + constant"), 25)}) {
     SCOPED_TRACE(fitted.model.name);
-    const Posterior posterior(
-        fitted.prior, fitted.observations,
-        model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+    const Posterior posterior = fitted.posterior();
     const View view = View::constrained_acceleration(*fitted.model.system);
     const MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 2).states;
     MatrixXd start = states;
@@ -595,9 +585,7 @@ TEST(NonlinearInverseDynamics, FindsInputsWhoseForceChangesTheFriction) {
 // 1000 samples, each at states all over the region of the data and beyond
 TEST(PositiveLatent, AlongMinusTheVelocityFeedsNoEnergyInInAnySample) {
   const Fitted fitted(rubbing_bead("lambda", "se + constant", "positive = true"), 30);
-  const Posterior posterior(
-      fitted.prior, fitted.observations,
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+  const Posterior posterior = fitted.posterior();
   MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 1).states;
   states.middleRows(2, 2).rightCols(10) *= 1.5;
   const View learned = View::learned_force(*fitted.model.system);
@@ -630,8 +618,7 @@ force = ["-(0.2 + 0.1*q^2)*dq"]
 )toml",
                                    "pendulum");
   const Fitted fitted(model, 50);
-  const Fit found =
-      fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());
+  const Fit found = fitted.fit();
   const MatrixXd states = test::draw(model, 100, nonlinear_seed + 1).states;
   const View view = View::constrained_acceleration(*model.system);
   EXPECT_LE(test::largest(found.posterior.mean(view, states) - ModelMotion(model).acceleration(states)), 0.03);
@@ -644,13 +631,12 @@ force = ["-(0.2 + 0.1*q^2)*dq"]
 
 // The spring of a bead that rubs: its energy and the coefficient of friction together.
 TEST(NonlinearPosterior, LearnsAPotentialBesideAFriction) {
-  std::string text = rubbing_bead("lambda", "se + constant").text;
-  text.replace(text.find("[sampling]"), 10,
-               "[[latent]]\nname = \"spring\"\nfeatures = [\"x\"]\ndirections = \"potential\"\n[sampling]");
-  text.replace(text.find("[\"-mu*load*dx/v\""), 16, "[\"-mu*load*dx/v - 2*sin(2*x)\"");
+  const std::string text =
+      test::changed(rubbing_bead("lambda", "se + constant").text,
+                    {{"[sampling]", "[[latent]]\nname = \"spring\"\nfeatures = [\"x\"]\ndirections = \"potential\"\n[sampling]"},
+                     {"[\"-mu*load*dx/v\"", "[\"-mu*load*dx/v - 2*sin(2*x)\""}});
   const Fitted fitted(Model::parse(text, "bead on a spring"), 80);
-  const Fit found =
-      fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());
+  const Fit found = fitted.fit();
   const MatrixXd states = test::draw(fitted.model, 100, nonlinear_seed + 1).states;
   const View view = View::constrained_acceleration(*fitted.model.system);
   const MatrixXd truth = ModelMotion(fitted.model).acceleration(states);
@@ -664,15 +650,10 @@ TEST(NonlinearPosterior, LearnsAPotentialBesideAFriction) {
 
 TEST(NonlinearPosterior, GoesToAnotherSystem) {
   const Fitted fitted(rubbing_bead("lambda", "se + constant"), 60);
-  const Fit found =
-      fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());
-  std::string text = fitted.model.text;
-  text.replace(text.find("m = 0.2"), 7, "m = 0.4");
-  const Model heavier = Model::parse(text, "heavier");
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const View view =
-      test::under(View::constrained_acceleration(*heavier.system), make_other_system(fitted.model, heavier, options));
+  const Fit found = fitted.fit();
+  const Model heavier = Model::parse(test::changed(fitted.model.text, {{"m = 0.2", "m = 0.4"}}), "heavier");
+  const View view = test::under(View::constrained_acceleration(*heavier.system),
+                                make_other_system(fitted.model, heavier, {Prior::Mean::force, std::nullopt}));
   const MatrixXd states = test::draw(heavier, 100, nonlinear_seed + 1).states;
   const MatrixXd truth = ModelMotion(heavier).acceleration(states);
   EXPECT_LE((found.posterior.mean(view, states) - truth).norm(), 0.01 * truth.norm());
@@ -689,14 +670,10 @@ TEST(NonlinearPosterior, FindsANamedRowWhereverAnotherSystemHasIt) {
   };
   const Fitted fitted(with(floor + ", " + wall), 30);
   const Model turned = with(wall + ", " + floor);
-  const Posterior posterior(
-      fitted.prior, fitted.observations,
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
+  const Posterior posterior = fitted.posterior();
   const View own = View::constrained_acceleration(*fitted.model.system);
-  const View other =
-      test::under(View::constrained_acceleration(*turned.system), make_other_system(fitted.model, turned, options));
+  const View other = test::under(View::constrained_acceleration(*turned.system),
+                                 make_other_system(fitted.model, turned, {Prior::Mean::force, std::nullopt}));
   const MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 1).states;
   const MatrixXd mean = posterior.mean(own, states);
   EXPECT_LE((posterior.mean(other, states) - mean).norm(), 1e-11 * mean.norm());
@@ -763,16 +740,11 @@ dx   = [-1.5, 1.5]
 push = [-1, 1]
 )toml",
                                    "magnet");
-  PriorOptions prior_options;
-  prior_options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, prior_options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   const View view = View::constrained_acceleration(*model.system);
   for (const std::uint64_t seed : {15U, 17U, 18U, 19U, 25U, 26U}) {
-    const MatrixXd states = test::draw(model, 60, seed).states, elsewhere = test::draw(model, 200, seed + 1000).states;
-    MatrixXd y = ModelMotion(model).acceleration(states);
-    RandomStream random(seed);
-    for (double& one : y.reshaped()) one += 0.05 * random.normal();
-    const std::vector<Observations> observations{{states, view, y, VectorXd::Constant(2, 0.05)}};
+    const MatrixXd elsewhere = test::draw(model, 200, seed + 1000).states;
+    const std::vector<Observations> observations = {measured(model, 60, seed, 0.05)};
     FitOptions options;
     options.standard_errors = false;
     const Fit found = fit(prior, observations, default_hyperparameters(prior, observations, {}, Protocol()), options);
@@ -819,18 +791,11 @@ dx   = [-1.5, 1.5]
 push = [-1, 1]
 )toml",
                                    "spring");
-  PriorOptions prior_options;
-  prior_options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, prior_options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   FitOptions options;
   options.standard_errors = false;
   for (const std::uint64_t seed : {2U, 4U}) {
-    const MatrixXd states = test::draw(model, 60, seed).states;
-    MatrixXd y = ModelMotion(model).acceleration(states);
-    RandomStream random(seed);
-    for (double& one : y.reshaped()) one += 0.05 * random.normal();
-    const std::vector<Observations> observations{
-        {states, View::constrained_acceleration(*model.system), y, VectorXd::Constant(2, 0.05)}};
+    const std::vector<Observations> observations = {measured(model, 60, seed, 0.05)};
     const FitReport report =
         fit(prior, observations, default_hyperparameters(prior, observations, {"m"}, Protocol()), options).report;
     EXPECT_LT(report.negative_log_likelihood, -120) << "seed " << seed;
@@ -876,19 +841,13 @@ dth = [-0.6, 0.6]
 u   = [-2, 1]
 )toml",
                                    "ladder");
-  PriorOptions prior_options;
-  prior_options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, prior_options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   FitOptions options;
   options.n_restarts = 2;
   options.max_escapes = 0;
   for (const std::uint64_t seed : {6U, 11U}) {
-    const MatrixXd states = test::draw(model, 30, seed).states;
-    MatrixXd y = ModelMotion(model).acceleration(states);
-    RandomStream random(seed);
-    for (double& one : y.reshaped()) one += 1e-6 * random.normal();
-    const std::vector<Observations> observations{
-        {states, View::constrained_acceleration(*model.system), y, Noise(VectorXd::Constant(3, 0.05), /*is_estimated=*/true)}};
+    const std::vector<Observations> observations = {
+        measured(model, 30, seed, 1e-6).with_noise(Noise(VectorXd::Constant(3, 0.05), /*is_estimated=*/true))};
     const FitReport report = fit(prior, observations, default_hyperparameters(prior, observations, {}, {}), options).report;
     EXPECT_LT(report.negative_log_likelihood, -800) << "seed " << seed;
   }
@@ -900,8 +859,7 @@ TEST(NonlinearFit, TellsTheLikelihoodOfTheHyperparametersThatItTellsAndNotOfADra
   FitOptions options;
   options.n_restarts = 1;
   options.n_draws = 3;
-  const FitReport report =
-      fit(fitted.prior, observations, default_hyperparameters(fitted.prior, observations, {}, {}), options).report;
+  const FitReport report = fitted.fit(options).report;
   ASSERT_TRUE(report.draws);
   const Posterior optimum(fitted.prior, observations, model_values(fitted.prior, observations, report.hyperparameters));
   EXPECT_NEAR(report.negative_log_likelihood, optimum.negative_log_likelihood(), 1e-9);
@@ -912,7 +870,7 @@ TEST(NonlinearFit, EndsWhereLaplacesEvidenceHasNothingToGain) {
   for (const Fitted& fitted : {Fitted(rubbing_bead("lambda", "constant + matern32"), 60), Fitted(test::model_that_rubs(), 60)}) {
     SCOPED_TRACE(fitted.model.name);
     const std::vector<Observations>& observations = fitted.observations;
-    const Fit found = fit(fitted.prior, observations, default_hyperparameters(fitted.prior, observations, {}, {}), FitOptions());
+    const Fit found = fitted.fit();
     const auto objective = [&](const std::vector<Hyperparameter>& at) {
       const Posterior posterior(fitted.prior, observations, model_values(fitted.prior, observations, at));
       return posterior.negative_log_likelihood() + negative_log_hyperpriors(at, nullptr);
@@ -935,8 +893,7 @@ TEST(NonlinearFit, EndsWhereLaplacesEvidenceHasNothingToGain) {
 TEST(NonlinearPosterior, OfDataThatComeAndGoIsTheOneOfThoseThatAreThere) {
   const Fitted fitted(test::model_that_rubs(), 40);
   const Observations& all = fitted.observations.front();
-  const ModelValues values =
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+  const ModelValues values = fitted.values();
   const auto rows = [&](Index first, Index n) {
     return Observations(all.states().middleCols(first, n), all.view(), all.values().middleCols(first, n), all.noise().stddev());
   };
@@ -984,8 +941,7 @@ TEST(NonlinearPosterior, LeavesOutAStateOfSumsAsOneOfValues) {
   for (int k = 0; k < alone.view().size(); ++k) {
     for (int i = 0; i < alone.n_data(); ++i) sums.push_back({k, i, VectorXd::Ones(1), alone.values()(k, i), VectorXd::Ones(1)});
   }
-  const ModelValues values =
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+  const ModelValues values = fitted.values();
   const LeaveOneOut of_sums = leave_one_out(Posterior(fitted.prior, {alone.with_sums(sums)}, values)).front(),
                     of_values = leave_out(Posterior(fitted.prior, {alone}, values), alone.n_data()).stretches.front();
   EXPECT_LE(test::largest(of_sums.mean - of_values.mean), 1e-4 * test::largest(of_values.mean));
@@ -1000,7 +956,7 @@ struct ThroughPoints {
   ModelValues exact, values;
 
   explicit ThroughPoints(Fitted of, int most = 100'000) : fitted(std::move(of)) {
-    exact = model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+    exact = fitted.values();
     values = exact;
     values.inducing = choose_inducing_points(fitted.prior, fitted.observations, exact, {.most = most, .left_out = 1e-12}).points;
   }
@@ -1151,12 +1107,11 @@ TEST(NonlinearInducing, MoreObservationsAddToTheSums) {
 }
 
 void expect_nearly_exact(const Fitted& fitted) {
-  const std::vector<Hyperparameter> start = default_hyperparameters(fitted.prior, fitted.observations, {}, {});
   FitOptions options;
   options.n_restarts = 1;
-  const Fit exact = fit(fitted.prior, fitted.observations, start, options);
+  const Fit exact = fitted.fit(options);
   options.n_inducing = 60;
-  const Fit through = fit(fitted.prior, fitted.observations, start, options);
+  const Fit through = fitted.fit(options);
   ASSERT_TRUE(through.report.inducing.has_value());
   EXPECT_LE(through.report.inducing->left_out.sum(), 2);
   EXPECT_NEAR(through.report.objective, exact.report.objective, 3);
@@ -1172,7 +1127,6 @@ TEST(NonlinearInducing, AFitIsNearlyTheExactOne) {
 
 TEST(NonlinearInducing, AFitStoppedAnywhereHasWhatWasFoundExactlyToo) {
   const Fitted fitted(rubbing_bead("lambda", "constant + matern32"), 120);
-  const std::vector<Hyperparameter> start = default_hyperparameters(fitted.prior, fitted.observations, {}, {});
   for (const int n_inducing : {0, 20}) {
     FitOptions options;
     options.n_restarts = 1;
@@ -1180,14 +1134,14 @@ TEST(NonlinearInducing, AFitStoppedAnywhereHasWhatWasFoundExactlyToo) {
     options.n_inducing = n_inducing;
     int n_calls = 0;
     options.progress = [&](const Progress&) { ++n_calls; };
-    static_cast<void>(fit(fitted.prior, fitted.observations, start, options));
+    static_cast<void>(fitted.fit(options));
     for (const int call : {1, n_calls / 2, n_calls - 1}) {
       SCOPED_TRACE(fmt::format("{} points, after {} of {}", n_inducing, call, n_calls));
       std::atomic<bool> stop = false;
       int n = 0;
       options.stop = &stop;
       options.progress = [&](const Progress&) { stop = ++n >= call; };
-      const Fit found = fit(fitted.prior, fitted.observations, start, options);
+      const Fit found = fitted.fit(options);
       EXPECT_EQ(found.report.termination, FitReport::interrupted);
       EXPECT_FALSE(found.report.converged);
       EXPECT_TRUE(std::isfinite(found.report.objective));
@@ -1214,9 +1168,7 @@ TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
   // a part of the motion is no observation, of a posterior that grows either
   const Fitted fitted(test::model_that_rubs(), 25);
   const Observations& all = fitted.observations.front();
-  const Posterior posterior(
-      fitted.prior, fitted.observations,
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+  const Posterior posterior = fitted.posterior();
   View part = all.view();
   part.latent = 0;
   expect_says([&] { static_cast<void>(update(Posterior(posterior), all.with_view(part))); }, {"from the whole motion"});

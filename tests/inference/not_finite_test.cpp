@@ -40,9 +40,7 @@ features   = ["{}", "dx"]
 directions = {{ force = [["1"], ["{}"]] }}
 )toml",
                                        c.force, c.kernel, c.feature, c.direction);
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  return make_prior(Model::parse(text, c.name), options);
+  return make_prior(Model::parse(text, c.name), {Prior::Mean::force, std::nullopt});
 }
 
 MatrixXd states_from(const Prior& prior, double first_x) {

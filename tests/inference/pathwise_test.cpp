@@ -14,6 +14,7 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using test::evaluate_all;
 using test::largest;
 using test::Problem;
 using test::Quantity;
@@ -21,22 +22,6 @@ using testing::AllOf;
 using testing::HasSubstr;
 
 constexpr std::uint64_t pathwise_seed = 70707;
-
-// every quantity of every sample, one sample per column
-MatrixXd evaluate_all(const PathwiseSamples& paths, const std::vector<ViewAt>& quantities) {
-  Index n_rows = 0;
-  for (const ViewAt& at : quantities) n_rows += at.view.size() * at.states.cols();
-  MatrixXd samples(n_rows, paths.n_samples());
-  for (int s = 0; s < paths.n_samples(); ++s) {
-    Index row = 0;
-    for (const ViewAt& at : quantities) {
-      const MatrixXd values = paths.evaluate(s, at.view, at.states);
-      samples.col(s).segment(row, values.size()) = values.reshaped();
-      row += values.size();
-    }
-  }
-  return samples;
-}
 
 const System& surface() { return *test::model("models/surface.toml").system; }
 MatrixXd surface_states(int n) { return test::draw(test::model("models/surface.toml"), n, pathwise_seed + 1).states; }
@@ -119,10 +104,9 @@ TEST(PathwiseTest, LatentsAddUpAndLeaveTheMean) {
 
 TEST(PathwiseTest, ActsUnderAnotherSystem) {
   const Model& home = test::model("models/surface.toml");
-  std::string text = home.text;
-  const std::string surface_here = "p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1)";
-  text.replace(text.find(surface_here), surface_here.size(), "0.1*q1 - 0.15*q2 - 0.1*cos(3*q1)");
-  const Model other = Model::parse(text, "another surface");
+  const Model other = Model::parse(
+      test::changed(home.text, {{"p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1)", "0.1*q1 - 0.15*q2 - 0.1*cos(3*q1)"}}),
+      "another surface");
   const Posterior posterior = test::surface_posterior(pathwise_seed);
   const auto other_system = make_other_system(home, other);
   View there = View::all(Quantity::constrained_acceleration, *other.system);

@@ -296,8 +296,7 @@ directions = "force"
 )toml",
                                    "free mass");
   RandomStream random(posterior_seed);
-  MatrixXd states(5, 12);
-  for (double& entry : states.reshaped()) entry = random.normal();
+  const MatrixXd states = test::random_matrix(5, 12, random);
   Problem p{"free mass", make_prior(model, {Prior::Mean::force, std::nullopt, false}), {}, {}, states.rightCols(3), {}};
   const View view = View::all(Quantity::constrained_acceleration, *model.system);
   p.observations.push_back(test::observe(model, view, states.leftCols(9), random));
@@ -320,20 +319,7 @@ TEST(PosteriorTest, KnowsWhatItWasMadeOf) {
 }
 
 TEST(PosteriorTest, RefusesToPredictWhereTheMassMatrixIsIndefinite) {
-  const Model model = Model::parse(R"toml(
-name        = "cart"
-coordinates = ["x", "y"]
-[mechanics]
-mass  = [["1", "x"], ["x", "1"]]
-force = ["0", "0"]
-[constraints]
-position = ["y"]
-[[latent]]
-kernel     = "se"
-features   = ["x"]
-directions = "acceleration"
-)toml",
-                                   "cart");
+  const Model& model = test::model_of_a_mass_that_may_be_indefinite();
   const Prior prior = make_prior(model);
   const View view = View::all(Quantity::constrained_acceleration, *model.system);
   MatrixXd states = MatrixXd::Zero(5, 2);

@@ -136,9 +136,7 @@ dq2 = [-2, 2]
 
 TEST(Potential, MotionsOfTheMeanAndOfSamplesConserveEnergy) {
   const Model& model = double_pendulum();
-  PriorOptions of_force;
-  of_force.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, of_force);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   const GeneratedData data = test::draw(model, 40, potential_seed);
   const View view = View::constrained_acceleration(*model.system);
   const std::vector<Observations> observations = {

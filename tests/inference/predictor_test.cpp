@@ -130,8 +130,7 @@ directions = "force"
 )toml",
                                    "bead that is led");
   RandomStream random(predictor_seed);
-  MatrixXd states(3, 50);
-  for (double& entry : states.reshaped()) entry = random.normal();
+  const MatrixXd states = test::random_matrix(3, 50, random);
   const View ddq = View::constrained_acceleration(*model.system), a_bar = View::unconstrained_acceleration(*model.system);
   const std::vector<Observations> observations = {{states, ddq, MatrixXd::Zero(1, 50), VectorXd::Ones(1)}};
   const Posterior posterior(make_prior(model), observations, test::random_values(make_prior(model), observations, random));
@@ -277,8 +276,7 @@ directions = "force"
                                                  constraints),
                                      "two in a groove");
     RandomStream random(predictor_seed);
-    const MatrixXd states = test::random_vector(5 * 12, random).reshaped(5, 12);
-    const MatrixXd values = test::random_vector(2 * 12, random).reshaped(2, 12);
+    const MatrixXd states = test::random_matrix(5, 12, random), values = test::random_matrix(2, 12, random);
     const View a_bar = View::all(Quantity::unconstrained_acceleration, *model.system);
     const VectorXd noise = VectorXd::Constant(2, 0.3);
     const Posterior posterior(make_prior(model, {Prior::Mean::force, std::nullopt, false}),
@@ -321,8 +319,7 @@ directions = "force"
 )toml",
                                    "two in a groove");
   RandomStream random(predictor_seed);
-  const MatrixXd states = test::random_vector(5 * 12, random).reshaped(5, 12);
-  const MatrixXd values = test::random_vector(2 * 12, random).reshaped(2, 12);
+  const MatrixXd states = test::random_matrix(5, 12, random), values = test::random_matrix(2, 12, random);
   const VectorXd noise = VectorXd::Constant(2, 0.3);
   const Posterior posterior(make_prior(model, {Prior::Mean::force, std::nullopt, false}),
                             {{states, View::unconstrained_acceleration(*model.system), values, noise, false}},

@@ -28,6 +28,24 @@ directions = "acceleration"
   return model;
 }
 
+const Model& model_of_a_mass_that_may_be_indefinite() {
+  static const Model model = Model::parse(R"toml(
+name        = "cart"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["1", "x"], ["x", "1"]]
+force = ["0", "0"]
+[constraints]
+position = ["y"]
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)toml",
+                                          "cart");
+  return model;
+}
+
 const Model& model_with_friction() {
   static const Model model = Model::parse(R"toml(
 name        = "sledge"
@@ -96,24 +114,12 @@ directions = [["c*side"], ["0"], ["1"], ["lambda0(1) + m"]]
 }
 
 const Model& model_that_rubs() {
-  static const Model model = Model::parse(R"toml(
-name        = "runner that rubs"
-coordinates = ["x", "y", "z", { name = "heading", angle = true }]
-inputs      = ["u"]
-[parameters]
-m = 2.0
-e = 0.3
-h = 0.4
-c = 0.7
-[let]
-load = "sqrt(lambda(1)^2 + 0.7*c)"
-[mechanics]
-mass  = [["m", "0", "0", "e*cos(heading)"], ["0", "m", "0", "e"], ["0", "0", "m + 1", "0"], ["e*cos(heading)", "e", "0", "1"]]
-force = ["u*cos(heading) - c*dx*abs(dx)", "u*sin(heading)", "-9.81*m", "-m*dheading"]
-[constraints]
-position = ["z - h*x^2 - 0.2*y^2"]
-velocity = ["dx*sin(heading) - dy*cos(heading) + e*dheading"]
-[[latent]]
+  static const Model model =
+      Model::parse(changed(before_latents(model_with_a_load()),
+                           {{"runner on a bank", "runner that rubs"},
+                            {"load = \"sqrt(lambda0(1)^2 + c)\"\nside = \"lambda0(2)\"", "load = \"sqrt(lambda(1)^2 + 0.7*c)\""},
+                            {"[\"0\", \"0\", \"m\", \"0\"]", "[\"0\", \"0\", \"m + 1\", \"0\"]"}}) +
+                       R"toml([[latent]]
 name       = "friction"
 kernel     = "se"
 features   = ["dx", "heading"]
@@ -140,7 +146,7 @@ u        = [-2, 2]
 [truth]
 force = ["-0.1*load*dx", "-0.1*load*dy", "-0.1*load*dz", "-0.3*dheading"]
 )toml",
-                                          "runner that rubs");
+                   "runner that rubs");
   return model;
 }
 
@@ -260,6 +266,8 @@ const Model& another_swing() {
       "another swing");
   return other;
 }
+
+std::string before_latents(const Model& model) { return model.text.substr(0, model.text.find("[[latent]]")); }
 
 std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes) {
   for (const auto& [from, to] : changes) {
@@ -406,11 +414,7 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     }
   }
   RandomStream random(seed, 1000);
-  const auto random_states = [&](const Model& m) {
-    MatrixXd states(m.system->layout().size(), n + 3);
-    for (double& entry : states.reshaped()) entry = random.normal();
-    return states;
-  };
+  const auto random_states = [&](const Model& m) { return random_matrix(m.system->layout().size(), n + 3, random); };
   MatrixXd vanishing = random_states(model_with_a_vanishing_row());
   for (Index i = 0; i < vanishing.cols(); i += 2) vanishing(0, i) = 0;
   for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {

@@ -36,6 +36,9 @@ struct Problem {
 /// A row of the constraint that vanishes where x = 0, where the motion is free: the rank of T differs from state to state.
 const Model& model_with_a_vanishing_row();
 
+/// A cart whose mass matrix is indefinite where |x| > 1.
+const Model& model_of_a_mass_that_may_be_indefinite();
+
 /// Quadratic friction whose speed has no derivative at rest, with two latents, and a parameter everywhere.
 const Model& model_with_friction();
 
@@ -50,6 +53,9 @@ const Model& model_that_rubs_softly();
 
 /// The same on another bank, with another mass.
 const Model& another_bank();
+
+/// What a model file has before its latents.
+std::string before_latents(const Model& model);
 
 /// `text` with every `from` changed to `to`.
 std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes);

@@ -1,5 +1,7 @@
 #include "inference/sampling.hpp"
 
+#include "gp2/predictor.hpp"
+
 namespace gp2::test {
 
 std::vector<ViewAt> both_accelerations(const System& system, const MatrixXd& states) {
@@ -33,6 +35,39 @@ void expect_gauss_principle(const MatrixXd& samples, const MechanicsBatch& mecha
     const MatrixXd expected = (projection.T() * a_bar).colwise() + projection.Lb();
     EXPECT_LE(largest(ddq - expected), 100 * eps * (1 + largest(projection.T())) * (1 + largest(a_bar) + largest(ddq)));
   }
+}
+
+MatrixXd evaluate_all(const PathwiseSamples& paths, const std::vector<ViewAt>& quantities) {
+  Index n_rows = 0;
+  for (const ViewAt& at : quantities) n_rows += at.view.size() * at.states.cols();
+  MatrixXd samples(n_rows, paths.n_samples());
+  for (int s = 0; s < paths.n_samples(); ++s) {
+    Index row = 0;
+    for (const ViewAt& at : quantities) {
+      const MatrixXd values = paths.evaluate(s, at.view, at.states);
+      samples.col(s).segment(row, values.size()) = values.reshaped();
+      row += values.size();
+    }
+  }
+  return samples;
+}
+
+void expect_predictor_and_paths(const Posterior& posterior, const Problem& p, const PathwiseOptions& options) {
+  const View view = View::constrained_acceleration(*p.prior.system);
+  const Posterior::Marginal marginal = posterior.marginal(view, p.queries);
+  const Predictor predictor(posterior, view);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  const double tolerance = rounding(p);
+  for (Index i = 0; i < p.queries.cols(); ++i) {
+    VectorXd mean(view.size()), stddev(view.size());
+    ASSERT_EQ(predictor.mean_and_stddev(p.queries.col(i).array().isNaN().select(0, p.queries.col(i)), mean, stddev, workspace),
+              Predictor::Status::ok);
+    EXPECT_LE(largest(mean - marginal.mean.col(i)), tolerance * (1 + largest(marginal.mean)));
+    EXPECT_LE(largest(stddev.cwiseAbs2() - marginal.stddev().col(i).cwiseAbs2()),
+              tolerance * (1 + largest(marginal.stddev().cwiseAbs2())));
+  }
+  const auto quantities = both_accelerations(*p.prior.system, p.queries);
+  expect_moments(evaluate_all(sample_paths(posterior, 400, options), quantities), posterior.joint(quantities));
 }
 
 Posterior surface_posterior(std::uint64_t seed, double noise) {

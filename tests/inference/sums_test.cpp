@@ -3,8 +3,6 @@
 
 #include "gp2/error.hpp"
 #include "gp2/inference/leave_one_out.hpp"
-#include "gp2/inference/pathwise.hpp"
-#include "gp2/predictor.hpp"
 #include "inference/sampling.hpp"
 #include "input_error.hpp"
 #include "observations_testing.hpp"
@@ -75,32 +73,7 @@ TEST(Sums, OfOneValueEachAreThatValue) {
 TEST(Sums, AreSeenByPredictorsAndSamplesAlike) {
   for (const Problem& p : summed_problems()) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sums_seed));
-    const Posterior posterior = test::posterior_of(p);
-    const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
-    const Posterior::Marginal marginal = posterior.marginal(view, p.queries);
-    const Predictor predictor(posterior, view);
-    Predictor::Workspace workspace = predictor.make_workspace();
-    const double tolerance = test::rounding(p);
-    for (Index i = 0; i < p.queries.cols(); ++i) {
-      VectorXd mean(view.size()), stddev(view.size());
-      ASSERT_EQ(predictor.mean_and_stddev(p.queries.col(i).array().isNaN().select(0, p.queries.col(i)), mean, stddev, workspace),
-                Predictor::Status::ok);
-      EXPECT_LE(largest(mean - marginal.mean.col(i)), tolerance * (1 + largest(marginal.mean)));
-      EXPECT_LE(largest(stddev.cwiseAbs2() - marginal.stddev().col(i).cwiseAbs2()),
-                tolerance * (1 + largest(marginal.stddev().cwiseAbs2())));
-    }
-    const auto quantities = test::both_accelerations(*p.prior.system, p.queries);
-    const PathwiseSamples paths = sample_paths(posterior, 400, {40, sums_seed});
-    MatrixXd samples(posterior.joint(quantities).mean.size(), paths.n_samples());
-    for (int s = 0; s < paths.n_samples(); ++s) {
-      Index row = 0;
-      for (const ViewAt& at : quantities) {
-        const MatrixXd values = paths.evaluate(s, at.view, at.states);
-        samples.col(s).segment(row, values.size()) = values.reshaped();
-        row += values.size();
-      }
-    }
-    test::expect_moments(samples, posterior.joint(quantities));
+    test::expect_predictor_and_paths(test::posterior_of(p), p, {40, sums_seed});
   }
 }
 

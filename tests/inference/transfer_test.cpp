@@ -191,9 +191,7 @@ u  = [-3, 3]
 
 TEST(SeveralLatents, AreToldApartWhereTheirDirectionsAndFeaturesDiffer) {
   const Model& model = sledge_with_motor();
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   const VectorXd noise = VectorXd::Constant(2, 0.02);
   const GeneratedData data = generate(model, {80, transfer_seed, noise});
   const std::vector<Observations> observations = {

@@ -304,20 +304,7 @@ TEST(UpdateTest, RefusesWhatDoesNotFitAndKeepsThePosterior) {
 }
 
 TEST(UpdateTest, RefusesStatesWithoutMechanicsAndKeepsThePosterior) {
-  const Model model = Model::parse(R"toml(
-name        = "cart"
-coordinates = ["x", "y"]
-[mechanics]
-mass  = [["1", "x"], ["x", "1"]]
-force = ["0", "0"]
-[constraints]
-position = ["y"]
-[[latent]]
-kernel     = "se"
-features   = ["x"]
-directions = "acceleration"
-)toml",
-                                   "cart");
+  const Model& model = test::model_of_a_mass_that_may_be_indefinite();
   const View view = View::all(Quantity::constrained_acceleration, *model.system);
   Posterior posterior(make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()});
   Observations added{MatrixXd::Zero(5, 1), view, MatrixXd::Zero(2, 1), VectorXd::Ones(2), false};

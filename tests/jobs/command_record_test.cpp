@@ -120,9 +120,7 @@ TEST(CommandRecord, NeedsTimesInOrderAndRowsLateEnough) {
 TEST(CommandRecord, WhatDependsOnWhatWasBeforeIsPredictedAndNotCompared) {
   const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
   const Model model = late_cart(both);
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   const View view = View::constrained_acceleration(*model.system);
   const LogStates predicted = read_log_states(prior, view, model, log, {}),
                   compared = read_log_states(prior, view, model, log, {}, {"ddx"});
@@ -155,9 +153,7 @@ TEST(CommandRecord, OfAFitReachesAsFarAsWhatWasFound) {
   const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
   const Model model =
       late_cart(R"({ name = "u", delay = { value = 0.02, estimate = true }, lag = { value = 0.04, estimate = true } })");
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   const View view = View::constrained_acceleration(*model.system);
   EXPECT_EQ(read_log_states(prior, view, model, log, {}, {"ddx"}).accelerations.array().isNaN().count(), 22);
   std::vector<int> tenth;

@@ -30,11 +30,12 @@ VectorXd noise_of(const Model& model) {
   return Eigen::Map<const VectorXd>(stated.data(), std::ssize(stated));
 }
 
-LogData drawn_log(const std::string& file, int n, std::uint64_t seed) {
-  const Model& of = model(file);
-  GeneratedData data = generate(of, GenerateOptions{n, seed, noise_of(of)});
-  return {&of, std::move(data.states), std::move(data.accelerations)};
+LogData drawn_log(const Model& model, int n, std::uint64_t seed) {
+  GeneratedData data = generate(model, GenerateOptions{n, seed, noise_of(model)});
+  return {&model, std::move(data.states), std::move(data.accelerations)};
 }
+
+LogData drawn_log(const std::string& file, int n, std::uint64_t seed) { return drawn_log(model(file), n, seed); }
 
 LogData moving_log(const std::string& file, int n, double time_step, std::uint64_t seed) {
   const Model& of = model(file);
@@ -50,6 +51,15 @@ LogData moving_log(const std::string& file, int n, double time_step, std::uint64
     for (Index j = 0; j < noise.size(); ++j) column[j] += noise[j] * random.normal();
   }
   return {&of, std::move(motion.states), std::move(motion.accelerations)};
+}
+
+FitRequest fit_request(Model model, std::vector<CsvTable> logs) {
+  FitRequest request;
+  request.model = std::move(model);
+  for (CsvTable& log : logs) request.logs.push_back({std::move(log), nullptr});
+  request.problem.mean = Prior::Mean::force;
+  request.restarts = 1;
+  return request;
 }
 
 }  // namespace gp2::test

@@ -406,6 +406,15 @@ TEST(Derive, PartsBetweenPausesAreSmoothedByThemselves) {
   EXPECT_EQ(late.states.cols(), 197);
   EXPECT_THAT(late.notes, Contains(HasSubstr("; 3 rows of parts that are too short, or where nothing moves, are left out")));
   EXPECT_NEAR(late.accelerations(0, 97), -9 * std::sin(3.0), 0.2);
+  // a part at rest, however its one value is written
+  const DerivedData rest = derive(cart(), cart_log([](std::vector<Row>& rows) {
+                                    for (std::size_t k = 0; k < rows.size(); ++k) {
+                                      rows[k][0] = shortest(0.01 * static_cast<double>(k) + (k < 20 ? 0 : 86400));
+                                      if (k < 20) rows[k][1] = k % 2 == 0 ? "0.5" : "0.50";
+                                    }
+                                  }));
+  EXPECT_EQ(rest.states.cols(), 180);
+  EXPECT_THAT(rest.notes, Contains(HasSubstr("; 20 rows of parts that are too short, or where nothing moves, are left out")));
 }
 
 TEST(Derive, VelocitiesOfTheLogAreUsed) {

@@ -57,13 +57,9 @@ std::vector<std::string> alarms_of(const LogData& data) {
     for (const Finding& finding : check(*data.model, &log)) {
       if (finding.level != Finding::Level::good) add(finding.text);
     }
-    FitRequest request;
-    request.model = *data.model;
-    request.logs = {{log}};
-    request.problem.mean = Prior::Mean::force;
+    FitRequest request = test::fit_request(*data.model, {log});
     if (data.model->noise.stddev.empty()) request.problem.noise_stddev = test::noise_of(*data.model)[0];
     request.problem.estimate = std::vector<std::string>{};
-    request.restarts = 1;
     request.max_iterations = 40;
     request.max_escapes = 0;
     FitJob job = prepare_fit(std::move(request));

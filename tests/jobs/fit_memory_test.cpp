@@ -4,6 +4,7 @@
 
 #include <gmock/gmock.h>
 
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "io_testing.hpp"
 #include "test_models.hpp"
@@ -120,6 +121,22 @@ TEST(WithinMemory, ThatHoldsNoneIsToldTheRowsThatFit) {
   EXPECT_GT(most, 1000);
   EXPECT_EQ(within_memory(problem_of_size(most), on_threads(1), 0.5 * gigabyte, notes).max_side_by_side, 0);
   EXPECT_NE(input_error_of([&] { within_memory(problem_of_size(most + most / 10), on_threads(1), 0.5 * gigabyte, notes); }), "");
+}
+
+TEST(JointPrediction, ThatMemoryDoesNotHoldIsRefused) {
+  const FitProblem problem = problem_of_size(100);
+  const Posterior posterior(problem.prior, problem.observations,
+                            model_values(problem.prior, problem.observations, problem.hyperparameters));
+  const View view = View::constrained_acceleration(*problem.prior.system);
+  const auto error = [&](Eigen::Index n, std::optional<double> free) {
+    return input_error_of([&] { require_memory_of_joint(posterior, view, n, free); });
+  };
+  EXPECT_EQ(error(1'000'000, std::nullopt), "");
+  EXPECT_EQ(error(100, 0), "") << "a small one";
+  EXPECT_EQ(error(10'000, 18 * gigabyte), "");
+  EXPECT_THAT(error(10'000, 10 * gigabyte),
+              AllOf(HasSubstr("all 10000 rows takes 15.3 GB"), HasSubstr("10.0 GB are free; take fewer rows")));
+  EXPECT_NE(error(30'000, 18 * gigabyte), "");
 }
 
 TEST(WithinMemory, TheResultIsTheSame) {

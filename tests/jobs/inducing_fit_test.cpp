@@ -23,11 +23,7 @@ using testing::HasSubstr;
 constexpr const char* surface = "models/surface.toml";  // two of three directions are free
 
 FitRequest request_of_rows(int n, const char* model = surface) {
-  FitRequest request;
-  request.model = test::model(model);
-  request.logs = {{test::drawn_log(model, n, 4).table(), nullptr}};
-  request.problem.mean = Prior::Mean::force;
-  request.restarts = 1;
+  FitRequest request = test::fit_request(test::model(model), {test::drawn_log(model, n, 4).table()});
   request.max_escapes = 0;
   request.threads = 2;
   return request;

@@ -20,11 +20,7 @@ using testing::Not;
 constexpr const char* surface = "models/surface.toml";
 
 FitRequest request_of_rows(int n, HyperparameterChoice choice) {
-  FitRequest request;
-  request.model = test::model(surface);
-  request.logs = {{test::drawn_log(surface, n, 4).table(), nullptr}};
-  request.problem.mean = Prior::Mean::force;
-  request.restarts = 1;
+  FitRequest request = test::fit_request(test::model(surface), {test::drawn_log(surface, n, 4).table()});
   request.max_escapes = 0;
   request.threads = 2;
   request.hyperparameters = choice;

@@ -9,7 +9,7 @@
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/report_job.hpp"
 #include "gp2/simulation/generate.hpp"
-#include "test_models.hpp"
+#include "inference/problems.hpp"
 
 namespace gp2 {
 namespace {
@@ -31,12 +31,6 @@ const Machine finger = {"experiments/mechanisms/finger_on_plate.toml",
                         R"(["x", "y", "dx", "dy", "fx", "fy", "fz", "v"])",
                         R"({ force = [["-dx/v"], ["-dy/v"], ["-dz/v"]] })"};
 
-std::string replaced(std::string text, const std::string& from, const std::string& to) {
-  const std::size_t at = text.find(from);
-  EXPECT_NE(at, std::string::npos) << from;
-  return text.replace(at, from.size(), to);
-}
-
 // the machine's model with the friction itself as its latent, of the default prior
 Model with_latent(const Machine& machine) {
   std::string text = test::model(machine.file).text;
@@ -46,10 +40,7 @@ Model with_latent(const Machine& machine) {
 }
 
 Posterior fitted(const Model& model, const Machine& machine, int n, std::uint64_t seed) {
-  FitRequest request;
-  request.model = model;
-  request.logs = {{test::drawn_log(machine.file, n, seed).table(), nullptr}};
-  request.problem.mean = Prior::Mean::force;
+  FitRequest request = test::fit_request(model, {test::drawn_log(machine.file, n, seed).table()});
   request.hyperparameters = HyperparameterChoice::optimise;
   request.restarts = 2;
   request.threads = 2;
@@ -75,9 +66,7 @@ INSTANTIATE_TEST_SUITE_P(Machines, FrictionOfALoad, testing::Values(&wire, &fing
 TEST_P(FrictionOfALoad, IsLearnedFromFewRowsAndHoldsAtTwiceTheVelocities) {
   const Machine& machine = *GetParam();
   const Model& model = test::model(machine.file);
-  std::string faster = model.text;
-  for (const auto& [from, to] : machine.twice_as_fast) faster = replaced(faster, from, to);
-  const Model fast_model = Model::parse(faster, machine.file);
+  const Model fast_model = Model::parse(test::changed(model.text, machine.twice_as_fast), machine.file);
   const Model without_load = with_latent(machine);
   double covered = 0, growth = 0, n_fits = 0;
   for (const auto& [n, seed] : std::vector<std::pair<int, std::uint64_t>>{{20, 1}, {20, 2}, {20, 3}, {100, 1}}) {

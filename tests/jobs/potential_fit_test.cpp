@@ -62,11 +62,7 @@ CsvTable log_of(int n, std::uint64_t seed) {
 }
 
 FitRequest request_of_swing() {
-  FitRequest request;
-  request.model = swing();
-  request.logs = {{log_of(25, 1), nullptr}, {log_of(15, 2), nullptr}};
-  request.problem.mean = Prior::Mean::force;
-  request.restarts = 1;
+  FitRequest request = test::fit_request(swing(), {log_of(25, 1), log_of(15, 2)});
   request.max_escapes = 0;
   request.hyperparameters = HyperparameterChoice::optimise;
   return request;
@@ -165,12 +161,9 @@ dy = [-1, 1]
 )toml",
                                    "springs");
   for (const Prior::Mean mean : {Prior::Mean::force, Prior::Mean::zero}) {
-    FitRequest request;
-    request.model = model;
     const GeneratedData data = test::draw(model, 30, 1);
-    request.logs = {{test::LogData{&model, data.states, data.accelerations}.table(), nullptr}};
+    FitRequest request = test::fit_request(model, {test::LogData{&model, data.states, data.accelerations}.table()});
     request.problem.mean = mean;
-    request.restarts = 1;
     const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
     SimulateRequest asked;
     asked.start = VectorXd((VectorXd(4) << 0.8, 0, 0, 0.3).finished());

@@ -4,10 +4,12 @@
 #include <numbers>
 #include <random>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "base/not_a_number.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 namespace gp2 {
 
@@ -80,7 +82,7 @@ std::string text_of_few_rows(double error_size, unsigned seed) {
 TEST(RateCheck, ErrorsThatGoTogetherInFewRowsAreNoFactorAndNoLag) {
   for (unsigned seed = 1; seed <= 400; ++seed) {
     EXPECT_THAT(text_of_few_rows(0.05, seed), IsEmpty()) << seed;
-    EXPECT_THAT(text_of_few_rows(0.15, seed), Not(HasSubstr("the column"))) << "errors as large as the rate, " << seed;
+    EXPECT_THAT(text_of_few_rows(0.15, seed), Not(HasSubstr("the column l"))) << "errors as large as the rate, " << seed;
   }
 }
 
@@ -100,8 +102,9 @@ TEST(RateCheck, ALagIsNamedHoweverFineTheLog) {
 }
 
 TEST(RateCheck, AFactorIsNamedUnderNoiseThatHidesSingleRows) {
-  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = -1}.text()), HasSubstr("it is -"));
-  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = 180 / std::numbers::pi}.text()), HasSubstr("it is 0.017"));
+  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = -1}.text()), testing::EndsWith(": a wrong sign"));
+  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = 180 / std::numbers::pi}.text()),
+              testing::AllOf(HasSubstr("the rate is 0.017"), testing::EndsWith(" × the column: degrees instead of radians")));
 }
 
 TEST(RateCheck, AnOffsetIsNamed) {
@@ -133,16 +136,16 @@ TEST(RateCheck, SwappedColumnsAreNamedOfCoordinatesThatMoveTogether) {
 TEST(RateCheck, FewWrongValuesSayNothingOfTheirColumn) {
   for (const double outliers : {0.5, -3.0, 30.0, 1e4}) {
     EXPECT_THAT((Swing{.noise = 0.01, .outliers = outliers}.text()), IsEmpty()) << outliers;
-    EXPECT_THAT((Swing{.noise = 0.01, .factor = 57, .outliers = outliers}.text()), HasSubstr("it is 0.017")) << outliers;
+    EXPECT_THAT((Swing{.noise = 0.01, .factor = 57, .outliers = outliers}.text()), HasSubstr("the rate is 0.017")) << outliers;
     EXPECT_THAT((Swing{.noise = 0.01, .late = 0.1, .outliers = outliers}.text()), HasSubstr("lags by 0.1")) << outliers;
   }
 }
 
 TEST(RateCheck, AFactorAndALagAreBothNamed) {
-  EXPECT_THAT((Swing{.factor = 1.2}.text()), HasSubstr("it is 0.83"));
+  EXPECT_THAT((Swing{.factor = 1.2}.text()), HasSubstr("the rate is 0.83"));
   EXPECT_THAT((Swing{.factor = 1.02}.text()), IsEmpty());
   EXPECT_THAT((Swing{.late = 0.1, .factor = 57}.text()),
-              testing::AllOf(HasSubstr("it is 0.016"), HasSubstr("; the column lags by 0.1")));
+              testing::AllOf(HasSubstr("the rate is 0.016"), HasSubstr("; the column lags by 0.1")));
 }
 
 TEST(RateCheck, AnotherColumnIsNamed) {
@@ -172,6 +175,42 @@ TEST(RateCheck, AColumnThatIsNoRateIsNamedWhateverItIs) {
     const std::vector<std::string> names = {"dx"};
     EXPECT_THAT(better_rate({t, "x", value, false, {copy}, names, 0}), HasSubstr("is neither this rate nor noise")) << noise;
   }
+}
+
+// What a fit of a model that does not read the time says of a swing that is logged over the time.
+std::vector<std::string> rate_notes_of_fit(double unit_of_time, double factor_of_velocity, const std::string& time = "") {
+  const Model model = Model::parse(R"(
+coordinates = ["x"]
+[mechanics]
+mass = [["1"]]
+force = ["-9*x"]
+[noise]
+ddq = 0.01
+[[latent]]
+name = "friction"
+kernel = "se"
+features = ["dx"]
+directions = "force"
+)",
+                                   "a spring");
+  std::string text = "t,x,dx,ddx\n";
+  for (int i = 0; i < 200; ++i) {
+    const double t = 0.05 * i, phase = 3 * t;
+    text += fmt::format("{},{},{},{}\n", time.empty() ? fmt::format("{}", unit_of_time * t) : time, std::sin(phase),
+                        factor_of_velocity * 3 * std::cos(phase), -9 * std::sin(phase));
+  }
+  std::vector<std::string> notes = make_fit_problem(model, CsvTable::parse(text, "log.csv"), {}).notes;
+  std::erase_if(notes, [](const std::string& note) { return note.find("is not the rate of") == std::string::npos; });
+  return notes;
+}
+
+TEST(RateNotes, OfAFitDoNotNeedAModelThatReadsTheTime) {
+  EXPECT_THAT(rate_notes_of_fit(1, 1), IsEmpty());
+  EXPECT_THAT(rate_notes_of_fit(1, -1),
+              testing::ElementsAre(testing::StartsWith("warning: log.csv: dx is not the rate of x over t: the rate is -1 × ")));
+  EXPECT_THAT(rate_notes_of_fit(1e9, 1), IsEmpty()) << "nanoseconds";
+  EXPECT_THAT(rate_notes_of_fit(1e3, -1), testing::SizeIs(1)) << "milliseconds";
+  EXPECT_THAT(rate_notes_of_fit(1, 1, "noon"), IsEmpty());
 }
 
 TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {

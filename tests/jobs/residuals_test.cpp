@@ -12,6 +12,7 @@
 #include "gp2/jobs/update_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
+#include "inference/problems.hpp"
 #include "jobs/data_of_model.hpp"
 #include "jobs/late_cart.hpp"
 #include "test_models.hpp"
@@ -21,6 +22,7 @@ namespace {
 
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using test::fit_request;
 using testing::Contains;
 using testing::HasSubstr;
 using testing::Not;
@@ -30,11 +32,8 @@ using Data = test::LogData;
 Data data_of(const std::string& file, std::uint64_t seed) { return test::drawn_log(file, 60, seed); }
 
 std::vector<std::string> notes_of_fit(const Data& data, Prior::Mean mean = Prior::Mean::force) {
-  FitRequest request;
-  request.model = *data.model;
-  request.logs = {{data.table()}};
+  FitRequest request = fit_request(*data.model, {data.table()});
   request.problem.mean = mean;
-  request.restarts = 1;
   request.max_iterations = 60;
   return run_fit(prepare_fit(std::move(request))).notes;
 }
@@ -122,13 +121,9 @@ struct LastingErrors {
     }
   }
   [[nodiscard]] FitOutcome fit(bool thin) const {
-    FitRequest request;
-    request.model = *data.model;
-    request.logs = {{data.table()}};
-    request.problem.mean = Prior::Mean::force;
+    FitRequest request = fit_request(*data.model, {data.table()});
     request.problem.noise_stddev = noise;
     request.problem.estimate = std::vector<std::string>();
-    request.restarts = 1;
     request.thin = thin;
     return run_fit(prepare_fit(std::move(request)));
   }
@@ -192,12 +187,7 @@ directions = "force"
     const double ddy = -std::sin(t) - 2.916 * std::sin(2.7 * t), f = 2 * ddy + 2 * dy + 3 * y - unlogged * std::sin(1.7 * t);
     log += fmt::format("{},{},{},{},{}\n", t, y, dy, f, ddy + 0.05 * random.normal());
   }
-  FitRequest request;
-  request.model = model;
-  request.logs = {{CsvTable::parse(log, "sledge.csv")}};
-  request.problem.mean = Prior::Mean::force;
-  request.restarts = 1;
-  return run_fit(prepare_fit(std::move(request)));
+  return run_fit(prepare_fit(fit_request(model, {CsvTable::parse(log, "sledge.csv")})));
 }
 
 TEST(Residuals, TellOfAMassThatIsWrong) {
@@ -264,8 +254,7 @@ dx = [-2, 2]
 dy = [-2, 2]
 )toml",
                                     "thrown.toml");
-  GeneratedData drawn = generate(thrown, GenerateOptions{60, 16, test::noise_of(thrown)});
-  Data data = {&thrown, std::move(drawn.states), std::move(drawn.accelerations)};
+  Data data = test::drawn_log(thrown, 60, 16);
   EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero),
               Contains(HasSubstr("the known force of [mechanics] is not used: with `mean=force` the log likelihood")));
   EXPECT_THAT(notes_of_fit(data, Prior::Mean::force), Not(Contains(HasSubstr("known force"))));
@@ -313,14 +302,10 @@ w  = [-3, 3]
   // another force by `u`
   explicit Driven(const std::string& of_u = "u") : model(Model::parse(with_force(of_u), "driven.toml")) {}
   static std::string with_force(const std::string& of_u) {
-    std::string text = toml;
-    return text.replace(text.find("\"u - w*y\"") + 1, 1, of_u);
+    return test::changed(toml, {{"\"u - w*y\"", "\"" + of_u + " - w*y\""}});
   }
 
-  [[nodiscard]] Data data(std::uint64_t seed) const {
-    GeneratedData drawn = generate(model, GenerateOptions{60, seed, test::noise_of(model)});
-    return {&model, std::move(drawn.states), std::move(drawn.accelerations)};
-  }
+  [[nodiscard]] Data data(std::uint64_t seed) const { return test::drawn_log(model, 60, seed); }
   [[nodiscard]] Eigen::Index row_of(int input) const { return model.system->layout().u(input); }
 };
 
@@ -332,10 +317,8 @@ struct WithForces {
 
   // friction along the track alone, which the latent can be
   WithForces() {
-    std::string text = driven.model.text;
-    for (const char* const part : {" - 0.2*dx*abs(dx)", " - 0.2*dy*abs(dy)"})
-      text.erase(text.find(part), std::string(part).size());
-    driven.model = Model::parse(text, "driven.toml");
+    driven.model =
+        Model::parse(test::changed(driven.model.text, {{" - 0.2*dx*abs(dx)", ""}, {" - 0.2*dy*abs(dy)", ""}}), "driven.toml");
     GeneratedData drawn = generate(driven.model, GenerateOptions{60, 41, VectorXd::Zero(3)});
     RandomStream random(41, 1);
     for (double& one : noise) one = random.normal();
@@ -345,10 +328,8 @@ struct WithForces {
     states = std::move(drawn.states);
   }
   [[nodiscard]] FitOutcome fit(const VectorXd& forces, bool has_accelerations = true) const {
-    FitRequest request;
-    request.model = driven.model;
+    FitRequest request = fit_request(driven.model, {});
     if (has_accelerations) request.logs = {{driven.data(41).table()}};
-    request.problem.mean = Prior::Mean::force;
     request.problem.also_noise_stddev = 0.1;
     SideInformation measured;
     measured.quantity = View::Quantity::multipliers;
@@ -361,7 +342,6 @@ struct WithForces {
     columns.push_back({"lambda1", {forces.begin(), forces.end()}});
     measured.log.table = CsvTable::from_columns("forces.csv", std::move(columns));
     request.also = {measured};
-    request.restarts = 1;
     request.max_iterations = 60;
     return run_fit(prepare_fit(std::move(request)));
   }
@@ -452,12 +432,8 @@ TEST(Residuals, AskInputsThatMakeALoad) {
 TEST(Residuals, AnEstimatedNoiseDoesNotHideAUnit) {
   const Driven driven;
   const auto notes_with = [&](const Data& data) {
-    FitRequest request;
-    request.model = driven.model;
-    request.logs = {{data.table()}};
-    request.problem.mean = Prior::Mean::force;
+    FitRequest request = fit_request(driven.model, {data.table()});
     request.problem.estimate_noise = true;
-    request.restarts = 1;
     return notes_of(run_fit(prepare_fit(std::move(request))).notes, of_constraint);
   };
   Data data = driven.data(51);
@@ -469,12 +445,8 @@ TEST(Residuals, AnEstimatedNoiseDoesNotHideAUnit) {
 TEST(Residuals, OfARobustFitLeaveOutWhatItDistrusts) {
   Data data = test::drawn_log("models/surface.toml", 60, 52);
   for (const Eigen::Index row : {5, 31}) data.accelerations(0, row) = -9999;
-  FitRequest request;
-  request.model = *data.model;
-  request.logs = {{data.table()}};
-  request.problem.mean = Prior::Mean::force;
+  FitRequest request = fit_request(*data.model, {data.table()});
   request.problem.robust = true;
-  request.restarts = 1;
   const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
   EXPECT_GE(outcome.file.report.distrusted.size(), 2U);
   EXPECT_LT(outcome.cross_validation->one_by_one.nrmse, 0.3);
@@ -491,12 +463,8 @@ TEST(Residuals, TellOfNoiseThatIsStatedTooLarge) {
   const Driven driven;
   const Data data = driven.data(46);
   const auto notes_under = [&](double noise) {
-    FitRequest request;
-    request.model = driven.model;
-    request.logs = {{data.table()}};
-    request.problem.mean = Prior::Mean::force;
+    FitRequest request = fit_request(driven.model, {data.table()});
     request.problem.noise_stddev = noise;
-    request.restarts = 1;
     return notes_of(run_fit(prepare_fit(std::move(request))).notes, "than the stated noise");
   };
   EXPECT_THAT(notes_under(0.05), testing::IsEmpty());
@@ -508,12 +476,8 @@ TEST(Residuals, TellOfAnInputThatIsWrongInOneOfSeveralLogs) {
   const Driven driven;
   const std::vector<Data> sound = {driven.data(41), driven.data(42), driven.data(43)};
   const auto notes_with = [&](const Data& second) {
-    FitRequest request;
-    request.model = driven.model;
-    request.logs = {{sound[0].table()}, {second.table()}, {sound[2].table()}};
-    request.problem.mean = Prior::Mean::force;
-    request.restarts = 1;
-    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "warning: ");
+    const FitRequest request = fit_request(driven.model, {sound[0].table(), second.table(), sound[2].table()});
+    return notes_of(run_fit(prepare_fit(request)).notes, "warning: ");
   };
   EXPECT_THAT(notes_with(sound[1]), testing::IsEmpty());
   Data turned = sound[1];
@@ -529,10 +493,8 @@ TEST(Residuals, TellOfAnInputThatIsWrongInOneOfSeveralLogs) {
   heavier.accelerations /= 1.5;
   EXPECT_THAT(notes_of(notes_with(heavier), "likelihood"), Contains(HasSubstr("log 2 contradicts the others")));
   // nobody turned the motor on
-  std::string text = driven.model.text;
-  text.replace(text.find("u  = [-3, 3]"), 12, "u  = \"0\"");
   Driven idle;
-  idle.model = Model::parse(text, "driven.toml");
+  idle.model = Model::parse(test::changed(driven.model.text, {{"u  = [-3, 3]", "u  = \"0\""}}), "driven.toml");
   EXPECT_THAT(notes_with(idle.data(42)), testing::IsEmpty());
 }
 
@@ -549,12 +511,8 @@ TEST(Residuals, TellOfSingleValuesThatAreFarOff) {
 
 TEST(Residuals, TellOfAnInputThatActsLate) {
   const auto fit_to = [](CsvTable log) {
-    FitRequest request;
-    request.model = test::late_cart("'u'");
-    request.logs = {{std::move(log)}};
-    request.problem.mean = Prior::Mean::force;
+    FitRequest request = fit_request(test::late_cart("'u'"), {std::move(log)});
     request.thin = false;
-    request.restarts = 1;
     return request;
   };
   const auto notes_of_fit_to = [](FitRequest request) {
@@ -633,12 +591,7 @@ force = ["-60*(x - y) - 0.5*dx", "60*(x - y) - 0.4*dy"]
                                                       {"ddy", column(ddq.row(1))},
                                                       {"u", column(u)}});
   const auto notes_under = [&](const Model& model) {
-    FitRequest request;
-    request.model = model;
-    request.logs = {{log}};
-    request.problem.mean = Prior::Mean::force;
-    request.restarts = 1;
-    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input u");
+    return notes_of(run_fit(prepare_fit(fit_request(model, {log}))).notes, "the input u");
   };
   EXPECT_THAT(notes_under(right), testing::IsEmpty());
   EXPECT_THAT(notes_under(wrong), testing::ElementsAre(HasSubstr("the model does not explain what the input u does")));
@@ -683,17 +636,13 @@ TEST(Residuals, TellOfAnInputBesideViewsThatHaveNoMean) {
   const Driven driven;
   Data data = driven.data(37);
   data.states.row(driven.row_of(0)) *= -1;
-  FitRequest request;
-  request.model = driven.model;
-  request.logs = {{data.table()}};
-  request.problem.mean = Prior::Mean::force;
+  FitRequest request = fit_request(driven.model, {data.table()});
   request.problem.also_noise_stddev = 0.05;
   SideInformation known;
   known.quantity = View::Quantity::learned_force;
   known.log.table = CsvTable::parse(
       "x,y,z,dx,dy,dz,u,w,force_x,force_y,force_z\n0,0,0,0,0,0,1,1,0,0,0\n0.5,0,0.175,0,0,0,-2,1,0,0,0\n", "rest.csv");
   request.also = {known};
-  request.restarts = 1;
   EXPECT_THAT(notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input "),
               testing::ElementsAre(testing::AllOf(HasSubstr("input u: "), testing::ContainsRegex("acts -(1|0.9)"))));
 }
@@ -715,12 +664,7 @@ TEST(Residuals, OfAForceAcrossAConstraintThereAreNone) {
   text.replace(first, last + 1 - first, R"(directions = "force")");
   driven.model = Model::parse(text, "driven.toml");
   const Data data = driven.data(35);
-  FitRequest fit;
-  fit.model = driven.model;
-  fit.logs = {{data.table()}};
-  fit.problem.mean = Prior::Mean::force;
-  fit.restarts = 1;
-  const FitOutcome outcome = run_fit(prepare_fit(std::move(fit)));
+  const FitOutcome outcome = run_fit(prepare_fit(fit_request(driven.model, {data.table()})));
   PredictRequest request;
   request.covariance = PredictRequest::Covariance::stddev;
   EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data hardly determine"))));
@@ -735,14 +679,10 @@ TEST(Residuals, OfPureNoiseAreNotHeldAgainstTheModel) {
   // noise that hides all the motion and is stated as such: nothing can be predicted, and nothing is wrong
   Driven driven;
   Data data = driven.data(34);
-  FitRequest request;
-  request.problem.noise_stddev = 50;
   RandomStream random(34, 1);
   for (double& one : data.accelerations.reshaped()) one += 50 * random.normal();
-  request.model = driven.model;
-  request.logs = {{data.table()}};
-  request.problem.mean = Prior::Mean::force;
-  request.restarts = 1;
+  FitRequest request = fit_request(driven.model, {data.table()});
+  request.problem.noise_stddev = 50;
   const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
   EXPECT_GT(outcome.cross_validation->stretches->nrmse, 0.8);
   EXPECT_FALSE(outcome.cross_validation->predicts_little());
@@ -779,14 +719,13 @@ dy = "v*sin(h) + 0.1*dh*cos(h)"
   };
   for (const bool is_light : {true, false}) {
     const Model model = car(is_light ? "1e-4" : "10");
-    GeneratedData drawn = generate(model, GenerateOptions{60, 16, test::noise_of(model)});
+    Data data = test::drawn_log(model, 60, 16);
     RandomStream random(16, 1);
-    for (Eigen::Index i = 0; i < drawn.states.cols(); ++i) {
-      const double h = drawn.states(2, i), along = drawn.states(3, i) * std::cos(h) + drawn.states(4, i) * std::sin(h);
-      drawn.accelerations.col(i) = -drawn.states(5, i) * along * Eigen::Vector3d(std::sin(h), -std::cos(h), 0);
-      for (int k = 0; k < 3; ++k) drawn.accelerations(k, i) += 0.05 * random.normal();
+    for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
+      const double h = data.states(2, i), along = data.states(3, i) * std::cos(h) + data.states(4, i) * std::sin(h);
+      data.accelerations.col(i) = -data.states(5, i) * along * Eigen::Vector3d(std::sin(h), -std::cos(h), 0);
+      for (int k = 0; k < 3; ++k) data.accelerations(k, i) += 0.05 * random.normal();
     }
-    const Data data = {&model, std::move(drawn.states), std::move(drawn.accelerations)};
     const testing::Matcher<std::vector<std::string>> is_told =
         Contains(HasSubstr("the constraint alone causes far more than was measured: ddh"));
     EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero), is_light ? is_told : Not(is_told));

@@ -6,6 +6,7 @@
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "inference/problems.hpp"
 #include "input_error.hpp"
 #include "jobs/data_of_model.hpp"
 #include "test_models.hpp"
@@ -24,9 +25,7 @@ constexpr double slip = 0.2;  // m/s², 20 times the noise
 constexpr const char* exact_row = "velocity = [\"dq1*sin(q3) - dq2*cos(q3)\"]";
 
 std::string changed_unicycle(const std::string& to) {
-  std::string text = test::model("models/unicycle.toml").text;
-  text.replace(text.find(exact_row), std::string_view(exact_row).size(), to);
-  return text;
+  return test::changed(test::model("models/unicycle.toml").text, {{exact_row, to}});
 }
 
 const Model& slipping_unicycle() {
@@ -35,19 +34,11 @@ const Model& slipping_unicycle() {
   return model;
 }
 
-test::LogData slipping_log(int n, std::uint64_t seed) {
-  const Model& model = slipping_unicycle();
-  const GeneratedData data = generate(model, {n, seed, test::noise_of(model), {}});
-  return {&model, data.states, data.accelerations};
-}
+test::LogData slipping_log(int n, std::uint64_t seed) { return test::drawn_log(slipping_unicycle(), n, seed); }
 
 FitOutcome fit(const Model& model, const test::LogData& log) {
-  FitRequest request;
-  request.model = model;
-  request.logs = {{log.table()}};
-  request.problem.mean = Prior::Mean::force;
+  FitRequest request = test::fit_request(model, {log.table()});
   request.problem.estimate = std::vector<std::string>{"R", "Ic"};
-  request.restarts = 1;
   return run_fit(prepare_fit(std::move(request)));
 }
 

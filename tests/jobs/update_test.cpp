@@ -212,14 +212,10 @@ CsvTable block_log(const std::string& name, int n, double first, const std::stri
 }
 
 FitFile fit_of_block(const Model& model, std::vector<CsvTable> logs, bool estimates_noise = false) {
-  FitRequest request;
-  request.model = model;
-  for (CsvTable& log : logs) request.logs.push_back({std::move(log), nullptr});
-  request.restarts = 1;
+  FitRequest request = test::fit_request(model, std::move(logs));
   request.max_iterations = 3;
   request.max_escapes = 0;
   request.problem.estimate_noise = estimates_noise;
-  request.problem.mean = Prior::Mean::force;
   return run_fit(prepare_fit(std::move(request))).file;
 }
 

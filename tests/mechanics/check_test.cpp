@@ -183,6 +183,58 @@ position = ["z - a*x^2"]
   }
 }
 
+// Accelerations of a bead that obey z - a*x^2 up to noise.
+struct NoisyBead {
+  static constexpr int n = 100;
+  Model model = bead();
+  MatrixXd states = bead_states().replicate(1, n)(Eigen::all, Eigen::seqN(0, n));
+  MatrixXd ddq, noise = MatrixXd::Constant(2, n, 0.01);
+
+  NoisyBead() {
+    const MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, model.system->parameter_values());
+    std::mt19937 engine(48);
+    std::normal_distribution<double> normal;
+    ddq = MatrixXd::NullaryExpr(2, n, [&] { return normal(engine); });
+    for (int i = 0; i < n; ++i) ddq.col(i) = mechanics.projections[static_cast<std::size_t>(i)].constrain(ddq.col(i));
+    ddq += noise.cwiseProduct(MatrixXd::NullaryExpr(2, n, [&] { return normal(engine); }));
+  }
+
+  [[nodiscard]] std::vector<Finding> findings(const MatrixXd& stddev) const {
+    return check_data(*model.system, states, model.system->parameter_values(), ddq, stddev);
+  }
+  [[nodiscard]] Finding of_constraint(const MatrixXd& stddev) const {
+    for (Finding& one : findings(stddev)) {
+      if (one.text.starts_with("measured ddq")) return one;
+    }
+    return {Finding::Level::error, "not looked at"};
+  }
+};
+
+TEST(Check, OutliersAreNamedAsSuch) {
+  NoisyBead bead;
+  const MatrixXd unknown = MatrixXd::Constant(2, NoisyBead::n, std::nan(""));
+  EXPECT_EQ(bead.of_constraint(bead.noise).level, Finding::Level::good);
+  bead.ddq(1, 40) += 50;
+  bead.ddq(1, 70) -= 1e9;
+  bead.ddq(0, 15) += 0.4;
+  for (const MatrixXd& stddev : {bead.noise, unknown}) {
+    const Finding finding = bead.of_constraint(stddev);
+    EXPECT_EQ(finding.level, Finding::Level::warning);
+    EXPECT_THAT(finding.text, HasSubstr("only because of 2 of 100 rows (farthest off: row 71, 41): outliers of the log"));
+    EXPECT_THAT(finding.text, HasSubstr("`robust`"));
+  }
+}
+
+TEST(Check, AnErrorOfManyRowsIsNoOutlier) {
+  NoisyBead bead;
+  bead.ddq.row(1).array() += 9.81;
+  EXPECT_EQ(bead.of_constraint(bead.noise).level, Finding::Level::error);
+  EXPECT_THAT(bead.of_constraint(bead.noise).text, testing::Not(HasSubstr("outliers")));
+  bead = NoisyBead();
+  for (int i = 0; i < 7; ++i) bead.ddq(1, 10 * i) += 50;
+  EXPECT_THAT(bead.of_constraint(bead.noise).text, testing::Not(HasSubstr("outliers")));
+}
+
 // A hoist: two loads on one drum, whose rates of change are logged by one sensor.
 TEST(Check, AccelerationsMayDependOnEachOtherInPart) {
   const Model model = Model::parse(R"(

@@ -16,6 +16,7 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using test::random_matrix;
 using testing::AllOf;
 using testing::HasSubstr;
 
@@ -27,12 +28,6 @@ VectorXd random_parameters(const Kernel& kernel, RandomStream& random) {
   VectorXd values(static_cast<Index>(kernel.parameters().size()));
   for (double& value : values) value = std::exp2(2 * random.uniform() - 1);
   return values;
-}
-
-MatrixXd random_points(Index n, Index n_features, RandomStream& random) {
-  MatrixXd points(n, n_features);
-  for (double& entry : points.reshaped()) entry = random.normal();
-  return points;
 }
 
 double value_at(const Kernel& kernel, const VectorXd& x, const VectorXd& y, const VectorXd& values) {
@@ -166,7 +161,7 @@ TEST(KernelTest, ManyPointsAtOnceAreThePointsOneByOne) {
   for (const char* text : {"matern52", "se + linear*periodic"}) {
     const Kernel kernel = Kernel::parse(text, two_features);
     const VectorXd values = random_parameters(kernel, random);
-    const MatrixXd points = random_points(9, 2, random);
+    const MatrixXd points = random_matrix(9, 2, random);
     const VectorXd out = kernel.evaluate(points, points.row(4), values);
     for (Index i = 0; i < 9; ++i) {
       EXPECT_NEAR(out[i], value_at(kernel, points.row(i), points.row(4), values),
@@ -207,7 +202,7 @@ TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
   RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(GetParam(), two_features);
   const VectorXd values = random_parameters(kernel, random);
-  MatrixXd points = random_points(7, 2, random);
+  MatrixXd points = random_matrix(7, 2, random);
   const VectorXd point = points.row(3);  // one pair at no distance, where a Matérn kernel's r has no derivative
   const VectorXd w = test::random_vector(7, random);
   const auto weighted_sum = [&](const VectorXd& at) -> VectorXd {
@@ -242,11 +237,11 @@ TEST_P(KernelGradients, MatchDifferencesInEveryFeatureOfAPoint) {
   RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(GetParam(), two_features);
   const VectorXd values = random_parameters(kernel, random);
-  const MatrixXd points = random_points(21, 2, random);
-  const VectorXd point = random_points(1, 2, random).row(0);
+  const MatrixXd points = random_matrix(21, 2, random);
+  const VectorXd point = random_matrix(1, 2, random).row(0);
   const Columns columns(kernel, points, values, point);
   MatrixXd W = MatrixXd::Zero(columns.n(), 3);
-  W.topRows(21) = random_points(21, 3, random);
+  W.topRows(21) = random_matrix(21, 3, random);
   MatrixXd gradient(2, 3);
   KernelColumns::Workspace workspace;
   columns.of_points.differentiate(0, columns.n(), columns.point, columns.k.data(), W.data(), columns.n(), 3, gradient.data(),
@@ -275,7 +270,7 @@ TEST_P(KernelGrams, ArePositiveSemidefinite) {
   for (int trial = 0; trial < 10; ++trial) {
     SCOPED_TRACE(fmt::format("kernel {}, seed {}, trial {}", GetParam(), kernel_seed, trial));
     const VectorXd values = random_parameters(kernel, random);
-    const MatrixXd points = random_points(25, 2, random);
+    const MatrixXd points = random_matrix(25, 2, random);
     const MatrixXd gram = kernel.evaluate(points, points, values);
     const VectorXd eigenvalues = Eigen::SelfAdjointEigenSolver<MatrixXd>(gram).eigenvalues();
     // each entry is off by some ε of its terms: eigenvalues by at most 25 of them

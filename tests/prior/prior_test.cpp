@@ -6,8 +6,8 @@
 
 #include "gp2/error.hpp"
 #include "gp2/prior/latent_spec.hpp"
+#include "inference/problems.hpp"
 #include "input_error.hpp"
-#include "test_models.hpp"
 
 namespace gp2 {
 namespace {
@@ -19,24 +19,7 @@ constexpr std::uint64_t prior_seed = 30302;
 
 // directions and a force with parameters in them, on a mass matrix with parameters; the speed has no derivative at rest
 const Model& friction_model() {
-  static const Model model = Model::parse(R"toml(
-name        = "sledge"
-coordinates = ["x", { name = "heading", angle = true }]
-inputs      = ["u"]
-[parameters]
-m = 2.0
-J = 0.5
-e = 0.3
-c = 0.7
-k = 1.5
-[let]
-speed = "sqrt(dx^2 + k*dheading^2)"
-[mechanics]
-mass  = [["m", "m*e*cos(heading)"], ["m*e*cos(heading)", "J"]]
-force = ["u - c*speed*dx", "-c*dheading"]
-[constraints]
-velocity = ["dx*cos(heading) - e*dheading"]
-[[latent]]
+  static const Model model = Model::parse(test::before_latents(test::model_with_friction()) + R"toml([[latent]]
 name       = "slip"
 kernel     = "se"
 features   = ["dx*u", "heading"]
@@ -82,8 +65,7 @@ std::vector<PriorCase> prior_cases() {
 MatrixXd states_of(const Model& model) {
   if (!model.sampling.empty()) return test::draw(model, 5, prior_seed).states;
   RandomStream random(prior_seed);
-  MatrixXd states(model.system->layout().size(), 6);
-  for (double& entry : states.reshaped()) entry = random.normal();
+  MatrixXd states = test::random_matrix(model.system->layout().size(), 6, random);
   states.col(5).segment(model.system->nq(), model.system->nq()).setZero();  // at rest
   return states;
 }

@@ -177,8 +177,7 @@ directions = "acceleration"
                         "linkage");
   };
   RandomStream random(edge_cases_seed);
-  MatrixXd states(7, 15);
-  for (double& entry : states.reshaped()) entry = random.normal();
+  const MatrixXd states = test::random_matrix(7, 15, random);
   for (const auto& [constraints, freedom] : std::vector<std::pair<std::string, int>>{
            {R"-("x - sin(y)", "z - x*y")-", 1}, {R"-("x - sin(y)", "z - x*y", "x + 2*y + 3*z - 1")-", 0}}) {
     SCOPED_TRACE(constraints);

@@ -91,6 +91,18 @@ def test_parameter_is_estimated_with_exact_derivatives_and_without(surface, log)
     assert given.parameters["p1"] == pytest.approx(0.08, abs=0.005)
 
 
+def test_latents_may_come_one_by_one():
+    def speed(states):
+        return states[:, 1:2]
+
+    latents = [{"features": {"names": ["speed"], "function": speed, "reads": ["dx"]}}]
+    keys = {"coordinates": ["x"], "mass": [["1"]], "noise": 0.1, "truth": ["-dx"], "sampling": {"x": [-1, 1], "dx": [-1, 1]}}
+    system = gp2.System(**keys, latents=(latent for latent in latents))
+    log = system.generate(5)
+    expected = gp2.fit(gp2.System(**keys, latents=latents), log, max_iterations=0)
+    np.testing.assert_array_equal(gp2.fit(system, log, max_iterations=0).predict(log).cov, expected.predict(log).cov)
+
+
 def test_simulate_stays_on_constraints_with_residuals(surface):
     h = 0.5
 

@@ -1,5 +1,7 @@
 """gp2.derive: a raw log of positions, from a table to a fit."""
 
+import logging
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -49,6 +51,14 @@ def test_what_is_derived_is_fitted_by_its_own_noise(spring):
     posterior = gp2.fit(spring, table, restarts=1)
     states = np.array([[0.5, 1.0, 0.0]])
     assert abs(posterior.predict(states).mean[0, 0] + 4.5) < 0.2
+
+
+def test_notes_are_told_and_name_options_as_keywords(spring, caplog):
+    milliseconds = log() | {"t": 10.0 * np.arange(400)}
+    with caplog.at_level(logging.INFO, logger="gp2"):
+        _, report = gp2.derive(spring, milliseconds)
+    (note,) = [note for note in report["notes"] if "time_unit" in note]
+    assert note.endswith("give time_unit='s' if it is in seconds") and note in caplog.text
 
 
 def test_errors_name_what_is_wrong(spring):

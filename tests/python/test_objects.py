@@ -51,6 +51,59 @@ def test_logs_and_side_information_survive_a_pickle(arm, arm_log):
     assert fitted(*pickle.loads(pickle.dumps((log, also)))) == fitted(log, also)
 
 
+def public_values(thing):
+    """What a result shows of itself, with those of results in it."""
+    values = {}
+    for name in dir(thing):
+        if name.startswith("_") or callable(getattr(type(thing), name)):
+            continue
+        value = getattr(thing, name, None)  # a mean alone has no deviations
+        if isinstance(value, gp2.Table):
+            value = {column: value[column] for column in value}
+        many = isinstance(value, list)
+        values[name] = [public_values(one) if type(one).__module__ == "gp2._gp2" else one for one in (value if many else [value])]
+    return values
+
+
+def fit_of_a_cart():
+    cart = gp2.System(
+        coordinates=["x"], inputs=["u"], mass=[["1"]], force=["u"], latents=[{"features": ["dx"]}], noise=0.1, truth=["0"],
+        sampling={"x": [-1, 1], "dx": [-1, 1], "u": [-1, 1]},
+    )  # fmt: skip
+    return gp2.fit(cart, cart.generate(5), mean="force", max_iterations=0)
+
+
+def test_results_survive_a_pickle(posterior, arm, arm_log, arm_states, oscillator):
+    drawn = gp2.fit(oscillator, oscillator.generate(20), mean="force", restarts=1, noise_std="estimate")
+    points = gp2.fit(oscillator, oscillator.generate(40), restarts=1, inducing=10, hyperparameters="optimise", max_iterations=5)
+    start = {"shoulder": 0.9}
+    for result in (
+        posterior.predict(arm_states),
+        posterior.predict(arm_states, mean_only=True),
+        posterior.evaluate(arm_log),
+        posterior.cross_validate(),
+        posterior.report,
+        drawn.report,
+        points.report,
+        posterior.report.hyperparameters[0],
+        posterior.report.restarts[0],
+        arm.evaluate(arm_states),
+        gp2.check(arm, arm_log)[0],
+        posterior.simulate(start, [0, 0.1]),
+        gp2.simulate(arm, start, [0, 0.1]),
+        posterior.inverse_dynamics(arm_states, np.zeros((len(arm_states), 2))),
+        gp2.excite(fit_of_a_cart(), {"x": 0}, 1, {"u": (-1, 1)}, n_rows=40, n_motions=20),
+    ):
+        for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+            assert type(again) is type(result) and again is not result
+            np.testing.assert_equal(public_values(again), public_values(result))
+            if "object at" not in repr(result):
+                assert repr(again) == repr(result)
+    report = pickle.loads(pickle.dumps(posterior.report))
+    assert report.correlation("m2", "m2") == posterior.report.correlation("m2", "m2")
+    assert list(pickle.loads(pickle.dumps(posterior.predict(arm_states))).to_frame()) == list(posterior.predict(arm_states).to_frame())
+
+
 def test_systems_of_one_text_are_equal(arm, posterior):
     again = gp2.System.parse(arm.text, arm.name)
     assert again is not arm and again == arm and len({again, arm}) == 1

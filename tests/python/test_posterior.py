@@ -1,5 +1,6 @@
 """What a posterior does beside predicting: joint, samples, motions, growing data, files."""
 
+import json
 import threading
 
 import numpy as np
@@ -378,6 +379,51 @@ def test_a_motion_has_its_energy_where_the_model_has_a_potential(oscillator):
     np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-5)
     assert motion.energy_std is None
     assert gp2.simulate(oscillator, [0.5, 0.3], [0, 1]).energy is None
+
+
+@pytest.fixture
+def ball():
+    """Slides under dry friction and bounces."""
+    return gp2.System(
+        name="ball", coordinates=["x", "z"], inputs=["touch"], mass=[["1", "0"], ["0", "1"]], force=["-sign(dx)", "-9.81"],
+        constraints={"position": [{"expr": "z", "contact": "touch", "restitution": 0.5}]},
+    )  # fmt: skip
+
+
+def test_a_motion_tells_of_contacts_and_friction_as_the_command_does(ball, command, tmp_path):
+    start = {"x": 0.0, "dx": 0.5, "z": 1.0}
+    motion = gp2.simulate(ball, start, np.linspace(0, 2, 100))
+    first, last = motion.contact_events[0], motion.contact_events[-1]
+    assert first["t"] == pytest.approx(np.sqrt(2 / 9.81), abs=1e-6) and first["approach"] == pytest.approx(np.sqrt(2 * 9.81), abs=1e-6)
+    assert (first["contact"], first["kind"]) == ("z", "impact") and first["energy_loss"] == pytest.approx(0.75 * 9.81, abs=1e-5)
+    assert last["kind"] == "made"
+    (stick,) = motion.stick_events
+    assert stick == {"t": pytest.approx(0.5, abs=1e-6), "surface": "dx", "kind": "sticks"}
+    (tmp_path / "ball.toml").write_text(ball.text, encoding="utf-8")
+    outcome = command("simulate", "ball.toml", "--start", "x=0,dx=0.5,z=1", "--t-end", 2, "--json", "-o", "motion.csv")
+    report = json.loads(outcome.stdout)
+    assert motion.contact_events == report["contact_events"] and motion.stick_events == report["stick_events"]
+    assert gp2.simulate(ball, {"z": 1.0}, [0, 0.1]).contact_events == []
+
+
+def test_a_motion_that_cannot_go_on_leaves_what_was_reached(oscillator):
+    explodes = gp2.System(coordinates=["x"], mass=[["1"]], force=["x^3"], potential="-x^4/4")
+    times = np.linspace(0, 20, 201)
+    with pytest.raises(gp2.NumericalError, match="the step size fell to") as caught:
+        gp2.simulate(explodes, {"x": 1.0, "dx": 1.0}, times)
+    motion = caught.value.motion
+    n = len(motion.t)
+    assert 1.3 < motion.t[-1] < 1.4 and motion.q.shape == (n, 1) and len(motion.table) == len(motion.energy) == n
+    np.testing.assert_array_equal(motion.t[:-1], times[: n - 1])
+
+    posterior = gp2.fit(oscillator, oscillator.generate(20), mean="force", max_iterations=0)
+    with pytest.raises(gp2.NumericalError, match="max_steps") as caught:
+        posterior.simulate({"x": 0.5, "dx": 0.1}, times, max_steps=3)
+    assert caught.value.motion.std.shape == caught.value.motion.q.shape
+    with pytest.raises(gp2.NumericalError, match="^sample 0: .*max_steps") as caught:
+        posterior.simulate({"x": 0.5, "dx": 0.1}, times, max_steps=3, n_samples=2)
+    (motion,) = caught.value.motion
+    assert motion.t[-1] < 20
 
 
 def test_a_motion_starts_where_a_log_does(arm, posterior, tmp_path):

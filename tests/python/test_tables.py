@@ -125,6 +125,19 @@ def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):
     np.testing.assert_array_equal(back["elbow"], arm_log["elbow"])
 
 
+def test_a_table_has_its_own_name_or_the_one_that_is_given(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("x,said\n\n1,yes\n", encoding="utf-8")
+    columns = {"x": [1.0], "said": ["yes"]}
+    assert gp2.Table(columns).name == "data" and gp2.Table(columns, name="monday").name == "monday"
+    assert gp2.Table(path).name == str(path)
+    for table, place in [(gp2.Table(path, name="monday"), 3), (gp2.Table(gp2.Table(columns), name="monday"), 2)]:
+        assert table.name == "monday" and table["x"] == [1.0]
+        with pytest.raises(gp2.InputError, match=f"^monday:{place}: column 'said': 'yes' is not a finite number"):
+            table["said"]
+    assert gp2.Table(gp2.Table(columns, name="monday")).name == "monday"
+
+
 def test_numbers_go_through_a_table_unchanged():
     values = np.array([0.1, 1 / 3, 5e-324, -1.7976931348623157e308, 2**53 + 2])
     np.testing.assert_array_equal(gp2.Table({"x": values})["x"], values)
@@ -204,6 +217,11 @@ def test_resampled_rows_are_rows_of_the_table(arm, frame, caplog):
     with caplog.at_level(logging.INFO, logger="gp2"):
         assert len(gp2.resample(arm, gaps, 4, features=["elbow"])) == 4
     assert "data: 2 rows skipped" in caplog.text
+    assert "distances are in sin(elbow), cos(elbow), each divided by its standard deviation" in caplog.text
+    assert f"chosen: 4 of {len(frame)} rows; every other row is within " in caplog.text and "repeat" not in caplog.text
+    with caplog.at_level(logging.INFO, logger="gp2"):
+        gp2.resample(arm, pd.concat([frame, frame]), len(frame) + 3)
+    assert "the last 3 rows repeat those before them in every feature" in caplog.text
     with pytest.raises(gp2.InputError, match="fewer than the n = 1000"):
         gp2.resample(arm, frame, 1000, seed=1, features=[first])
 

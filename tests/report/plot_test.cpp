@@ -73,7 +73,7 @@ TEST_F(PlotCommand, SaysWhereThereIsNothingToDraw) {
   desk.write("mass.toml",
              "coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[[latent]]\nfeatures = ['dx']\n[noise]\nddq = 0.1\n");
   desk.done("gp2 fit mass.toml --data constant.csv --max-iterations 0 -o mass.json");
-  EXPECT_THAT(desk.run("gp2 plot mass.json -o mass.svg").err, HasSubstr("nothing to draw"));
+  EXPECT_THAT(desk.run("gp2 plot mass.json -o mass.svg").err, HasSubstr("nothing to plot"));
 }
 
 TEST(Plot, IsAPictureOfACurveThatIsFlatAndCertain) {

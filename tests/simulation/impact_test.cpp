@@ -240,9 +240,7 @@ force = ["-0.3*abs({0})*sign(dx)", "-0.03*abs({0})*sign(dx)"]
     states.row(2) << 1, -1, 2, -2, 0.5, -3;
     states.row(3) = 0.1 * states.row(2);
     states.row(5).setOnes();
-    PriorOptions prior_options;
-    prior_options.mean = Prior::Mean::force;
-    const Prior prior = make_prior(model, prior_options);
+    const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
     const View ddq = View::constrained_acceleration(*model.system);
     const std::vector<Observations> observed = {
         {states, ddq, ModelMotion(model).acceleration(states), VectorXd::Constant(2, 0.3)}};

@@ -118,53 +118,14 @@ GiNaC::numeric exact_number(double value) {
 }
 
 GiNaC::ex to_ginac(Expression e, const Symbols& symbols) {
-  const auto a = [&] { return to_ginac(e.left(), symbols); };
-  const auto b = [&] { return to_ginac(e.right(), symbols); };
-  switch (e.operation()) {
-    case Operation::constant:
-      return exact_number(e.constant_value());
-    case Operation::variable:
-      return symbols.at(e.variable_name());
-    case Operation::add:
-      return a() + b();
-    case Operation::subtract:
-      return a() - b();
-    case Operation::multiply:
-      return a() * b();
-    case Operation::divide:
-      return a() / b();
-    case Operation::negate:
-      return -a();
-    case Operation::power:
-      return GiNaC::pow(a(), b());
-    case Operation::sin:
-      return GiNaC::sin(a());
-    case Operation::cos:
-      return GiNaC::cos(a());
-    case Operation::tan:
-      return GiNaC::tan(a());
-    case Operation::asin:
-      return GiNaC::asin(a());
-    case Operation::acos:
-      return GiNaC::acos(a());
-    case Operation::atan:
-      return GiNaC::atan(a());
-    case Operation::sinh:
-      return GiNaC::sinh(a());
-    case Operation::cosh:
-      return GiNaC::cosh(a());
-    case Operation::tanh:
-      return GiNaC::tanh(a());
-    case Operation::exp:
-      return GiNaC::exp(a());
-    case Operation::log:
-      return GiNaC::log(a());
-    case Operation::sqrt:
-      return GiNaC::sqrt(a());
-    default:
-      ADD_FAILURE() << "an operation that these random expressions do not hold";
-      return 0;
-  }
+  const auto leaf = [&](Expression x) {
+    return x.is_constant() ? GiNaC::ex(exact_number(x.constant_value())) : symbols.at(x.variable_name());
+  };
+  const auto other = [](Expression) {
+    ADD_FAILURE() << "an operation that these random expressions do not hold";
+    return GiNaC::ex(0);
+  };
+  return test::evaluate_as<GiNaC::ex>(e, leaf, other);
 }
 
 /// The real value of e, or NaN.

@@ -12,15 +12,19 @@
 
 namespace gp2::test {
 
-/// e at the values of the variables, node by node as defined: the slow road that every fast one must meet.
-inline double evaluate(Expression e, const std::map<std::string, double>& values) {
-  const auto a = [&] { return evaluate(e.left(), values); };
-  const auto b = [&] { return evaluate(e.right(), values); };
+/// e in numbers of any kind, node by node as defined.
+/// @param leaf   of a constant or a variable
+/// @param other  of what is not differentiable everywhere
+template <typename Number, typename Leaf, typename Other>
+Number evaluate_as(Expression e, const Leaf& leaf, const Other& other) {
+  const auto a = [&] { return evaluate_as<Number>(e.left(), leaf, other); };
+  const auto b = [&] { return evaluate_as<Number>(e.right(), leaf, other); };
+  using std::acos, std::asin, std::atan, std::cos, std::cosh, std::exp, std::log, std::pow, std::sin, std::sinh, std::sqrt,
+      std::tan, std::tanh;
   switch (e.operation()) {
     case Operation::constant:
-      return e.constant_value();
     case Operation::variable:
-      return values.at(e.variable_name());
+      return leaf(e);
     case Operation::add:
       return a() + b();
     case Operation::subtract:
@@ -32,53 +36,51 @@ inline double evaluate(Expression e, const std::map<std::string, double>& values
     case Operation::negate:
       return -a();
     case Operation::power:
-      return std::pow(a(), b());
+      return pow(a(), b());
     case Operation::sin:
-      return std::sin(a());
+      return sin(a());
     case Operation::cos:
-      return std::cos(a());
+      return cos(a());
     case Operation::tan:
-      return std::tan(a());
+      return tan(a());
     case Operation::asin:
-      return std::asin(a());
+      return asin(a());
     case Operation::acos:
-      return std::acos(a());
+      return acos(a());
     case Operation::atan:
-      return std::atan(a());
+      return atan(a());
     case Operation::sinh:
-      return std::sinh(a());
+      return sinh(a());
     case Operation::cosh:
-      return std::cosh(a());
+      return cosh(a());
     case Operation::tanh:
-      return std::tanh(a());
+      return tanh(a());
     case Operation::exp:
-      return std::exp(a());
+      return exp(a());
     case Operation::log:
-      return std::log(a());
+      return log(a());
     case Operation::sqrt:
-      return std::sqrt(a());
-    case Operation::abs:
-      return std::abs(a());
-    case Operation::sign: {
-      const double u = a();
-      return std::isnan(u) ? u : (u > 0) - (u < 0);
-    }
-    case Operation::atan2:
-      return std::atan2(a(), b());
-    case Operation::min: {
-      const double u = a(), v = b();
-      return std::isnan(u) || std::isnan(v) ? NAN : std::min(u, v);
-    }
-    case Operation::max: {
-      const double u = a(), v = b();
-      return std::isnan(u) || std::isnan(v) ? NAN : std::max(u, v);
-    }
-    case Operation::multiply_or_zero: {
-      const double u = a();
-      return u == 0 ? 0.0 : u * b();
-    }
+      return sqrt(a());
+    default:
+      return other(e);
   }
-  return NAN;
+}
+
+/// e at the values of the variables: the slow road that every fast one must meet.
+inline double evaluate(Expression e, const std::map<std::string, double>& values) {
+  const auto leaf = [&](Expression x) { return x.is_constant() ? x.constant_value() : values.at(x.variable_name()); };
+  const auto other = [&](Expression f) -> double {
+    const double u = evaluate(f.left(), values);
+    if (f.operation() == Operation::abs) return std::abs(u);
+    if (f.operation() == Operation::sign) return std::isnan(u) ? u : (u > 0) - (u < 0);
+    if (f.operation() == Operation::multiply_or_zero && u == 0) return 0;
+    const double v = evaluate(f.right(), values);
+    if (f.operation() == Operation::multiply_or_zero) return u * v;
+    if (f.operation() == Operation::atan2) return std::atan2(u, v);
+    if (std::isnan(u) || std::isnan(v)) return NAN;
+    return f.operation() == Operation::min ? std::min(u, v) : std::max(u, v);
+  };
+  return evaluate_as<double>(e, leaf, other);
 }
 
 /// Draws expressions that are finite nearly everywhere: arguments of functions with a small domain are bounded first.

@@ -61,9 +61,7 @@ struct Found {
 };
 
 std::vector<Found> fit_of(const Model& model, const Observations& data, const std::vector<std::string>& estimated) {
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   FitOptions fit_options;
   fit_options.n_restarts = 2;
   fit_options.max_iterations = 60;
@@ -165,9 +163,7 @@ TEST(ConstraintParameters, HaveTheDeviationOfTheirPriorWhereNothingElseKnowsThem
 TEST(ConstraintParameters, AreNotDrawnWhereNothingKnowsThem) {
   const Model model = bead("x^2 + y^2 - l^2");
   const Observations data = observe(model, 1e-3, 5);
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   FitOptions fit_options;
   fit_options.n_restarts = 1;
   fit_options.max_iterations = 20;

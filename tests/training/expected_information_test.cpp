@@ -48,11 +48,7 @@ dx = [-2, 2]
   return model;
 }
 
-Prior with_force_mean() {
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  return make_prior(wire(), options);
-}
+Prior with_force_mean() { return make_prior(wire(), {Prior::Mean::force, std::nullopt}); }
 
 /// A prior with known hyperparameters, and measurements.
 struct Problem {
@@ -105,9 +101,7 @@ TEST(ExpectedInformation, OfLatentsThatAreNotLinearIsNearlyWhatTheLikelihoodOfAl
       test::changed(wire().text, {{"force = [[\"1\"], [\"0\"]] }", "force = [[\"-0.1*abs(lambda(1))*dx\"], [\"0\"]] }"},
                                   {"-0.4*tanh(dx)", "-0.05*abs(lambda(1))*dx"}}),
       "wire.toml");
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  const Prior prior = make_prior(model, options);
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
   const std::vector<Hyperparameter> hyperparameters = Problem({0, 1}).hyperparameters;
   const VectorXd noise = Eigen::Vector2d(0.03, 0.01);
   const auto measured = [&](int n, std::uint64_t seed) {

@@ -401,6 +401,13 @@ TEST(FitTest, EscapesFromACornerWhereTheGradientVanishes) {
     h.lower *= 1e-6;
     h.value = h.lower;
   }
+  // an escape begins anew, but the share of the work that is done does not fall
+  double done = 0;
+  options.progress = [&](const Progress& progress) {
+    EXPECT_GE(progress.fraction, done);
+    EXPECT_LE(progress.fraction, 1);
+    done = progress.fraction;
+  };
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
   EXPECT_GE(report.n_escapes, 1);
   // the way out need not lead to the lowest minimum of all, but to one of its kind

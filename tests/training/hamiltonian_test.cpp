@@ -13,7 +13,7 @@
 #include "gp2/inference/leave_one_out.hpp"
 #include "gp2/training/laplace.hpp"
 #include "input_error.hpp"
-#include "test_models.hpp"
+#include "training/drawn_problem.hpp"
 
 namespace gp2 {
 namespace {
@@ -21,33 +21,14 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using test::DrawnProblem;
 using Kind = Hyperparameter::Kind;
 
 constexpr std::uint64_t hamiltonian_seed = 90210;
 
-// ddx = p x + r + friction: the likelihood is quadratic in p and r.
 const Model& sloped_line() {
-  static const Model model = Model::parse(R"toml(
-name        = "line"
-coordinates = ["x"]
-[parameters]
-p = { value = 0.7, bounds = [-5, 5] }
-r = { value = 0.2, bounds = [-5, 5] }
-[mechanics]
-mass  = [["1"]]
-force = ["p*x + r"]
-[[latent]]
-kernel   = "se"
-features = ["dx"]
-[noise]
-ddq = 0.3
-[truth]
-acceleration = ["sin(3*dx)"]
-[sampling]
-x  = [-1, 2]
-dx = [-1, 1]
-)toml",
-                                          "line");
+  static const Model model =
+      Model::parse(test::changed(test::line().text, {{"acceleration = [\"0\"]", "acceleration = [\"sin(3*dx)\"]"}}), "line");
   return model;
 }
 
@@ -80,27 +61,8 @@ dx = [-1, 1]
   return model;
 }
 
-struct DrawProblem {
-  Prior prior;
-  std::vector<Observations> observations;
-  std::vector<Hyperparameter> hyperparameters;
-};
-
-DrawProblem make_problem(const Model& model, int n, const std::vector<std::string>& estimated, double noise_stddev = 0.3) {
-  const GenerateOptions options{n, hamiltonian_seed, VectorXd::Constant(model.system->nq(), noise_stddev)};
-  const GeneratedData data = generate(model, options);
-  PriorOptions with_force;
-  with_force.mean = Prior::Mean::force;
-  DrawProblem p{make_prior(model, with_force), {}, {}};
-  p.observations.push_back({data.states, View::all(View::Quantity::constrained_acceleration, *model.system), data.accelerations,
-                            options.noise_stddev});
-  p.hyperparameters = default_hyperparameters(p.prior, p.observations, estimated, {});
-  return p;
-}
-
-DrawProblem only(DrawProblem p, Kind kind, Kind other) {
-  std::erase_if(p.hyperparameters, [&](const Hyperparameter& h) { return h.kind != kind && h.kind != other; });
-  return p;
+DrawnProblem make_problem(const Model& model, int n, const std::vector<std::string>& estimated, double noise_stddev = 0.3) {
+  return test::drawn_problem(model, n, estimated, hamiltonian_seed, noise_stddev);
 }
 
 FitOptions drawing(int n_draws, int n_threads = 2) {
@@ -112,10 +74,10 @@ FitOptions drawing(int n_draws, int n_threads = 2) {
   return options;
 }
 
-Fit fit_of(const DrawProblem& p, const FitOptions& options) { return fit(p.prior, p.observations, p.hyperparameters, options); }
+Fit fit_of(const DrawnProblem& p, const FitOptions& options) { return fit(p.prior, p.observations, p.hyperparameters, options); }
 
 TEST(HamiltonianTest, DrawsAreOfAGaussianWhereTheLikelihoodIsQuadratic) {
-  const DrawProblem p = only(make_problem(sloped_line(), 30, {"p", "r"}), Kind::parameter, Kind::parameter);
+  const DrawnProblem p = only(make_problem(sloped_line(), 30, {"p", "r"}), {Kind::parameter});
   const FitReport report = fit_of(p, drawing(25)).report;
   ASSERT_TRUE(report.draws);
   const HyperparameterDraws& draws = *report.draws;
@@ -137,7 +99,7 @@ TEST(HamiltonianTest, DrawsAreOfAGaussianWhereTheLikelihoodIsQuadratic) {
 // Moments of v by the sum over a grid of the box of two hyperparameters, even in their coordinates.
 struct GridMoments {
   VectorXd mean = VectorXd::Zero(2), square = VectorXd::Zero(2);
-  explicit GridMoments(const DrawProblem& p) {
+  explicit GridMoments(const DrawnProblem& p) {
     const Objective objective(p.prior, p.observations, p.hyperparameters);
     constexpr int n = 80;
     MatrixXd J(n, n);
@@ -164,7 +126,7 @@ struct GridMoments {
 
 TEST(HamiltonianTest, MomentsAreThoseOfTheDensityWithinItsBox) {
   // lengthscale and signal of ten measurements: no Gaussian, and walls on both sides
-  DrawProblem p = only(make_problem(sloped_line(), 10, {}), Kind::kernel, Kind::signal_stddev);
+  DrawnProblem p = only(make_problem(sloped_line(), 10, {}), {Kind::kernel, Kind::signal_stddev});
   ASSERT_EQ(p.hyperparameters.size(), 2U);
   for (Hyperparameter& h : p.hyperparameters) {
     h.lower = h.value / 3;
@@ -189,7 +151,7 @@ TEST(HamiltonianTest, MomentsAreThoseOfTheDensityWithinItsBox) {
 }
 
 TEST(HamiltonianTest, SameSeedSameBitsForAnyNumberOfThreads) {
-  const DrawProblem p = make_problem(sloped_line(), 12, {"p"});
+  const DrawnProblem p = make_problem(sloped_line(), 12, {"p"});
   const Fit one = fit_of(p, drawing(5, 1)), three = fit_of(p, drawing(5, 3));
   EXPECT_EQ(one.report.draws->values, three.report.draws->values);
   EXPECT_EQ(one.report.draws->r_hat, three.report.draws->r_hat);
@@ -201,7 +163,7 @@ TEST(HamiltonianTest, SameSeedSameBitsForAnyNumberOfThreads) {
 
 TEST(HamiltonianTest, WhatIsHeldStaysPut) {
   // of the system's parameters none has equal bounds
-  DrawProblem p = make_problem(sloped_line(), 12, {"p"});
+  DrawnProblem p = make_problem(sloped_line(), 12, {"p"});
   for (Hyperparameter& h : p.hyperparameters) {
     if (h.kind == Kind::signal_stddev) h.lower = h.upper = h.value;
   }
@@ -224,7 +186,7 @@ TEST(HamiltonianTest, WhatIsHeldStaysPut) {
 
 TEST(HamiltonianTest, TheMixtureObeysOneConstraint) {
   // the slope enters A and b, the drag does not
-  const DrawProblem p = make_problem(slope(), 20, {"c", "s"}, 0.05);
+  const DrawnProblem p = make_problem(slope(), 20, {"c", "s"}, 0.05);
   const Fit fitted = fit_of(p, drawing(6));
   const HyperparameterDraws& draws = fitted.report.draws.value();
   for (std::size_t k = 0; k < p.hyperparameters.size(); ++k) {
@@ -248,7 +210,7 @@ TEST(HamiltonianTest, TheMixtureObeysOneConstraint) {
 }
 
 TEST(HamiltonianTest, AFitThatIsStoppedWhileItDrawsIsThatOfTheOptimum) {
-  const DrawProblem p = make_problem(sloped_line(), 12, {});
+  const DrawnProblem p = make_problem(sloped_line(), 12, {});
   const FitReport whole = fit_of(p, drawing(0)).report;
   for (const double from : {0.0, 0.5}) {
     std::atomic<bool> stop = false;
@@ -269,12 +231,12 @@ TEST(HamiltonianTest, AFitThatIsStoppedWhileItDrawsIsThatOfTheOptimum) {
 }
 
 TEST(HamiltonianTest, TheNumberOfDrawsIsChecked) {
-  const DrawProblem p = make_problem(sloped_line(), 5, {});
+  const DrawnProblem p = make_problem(sloped_line(), 5, {});
   EXPECT_EQ(test::input_error_of([&] { fit_of(p, drawing(-1)); }), "fit: n_draws must be at least 0, got -1");
 }
 
 TEST(HamiltonianTest, LeftOutValuesAreWeighedByWhatTheyDoToEachDraw) {
-  const DrawProblem p = make_problem(sloped_line(), 8, {});
+  const DrawnProblem p = make_problem(sloped_line(), 8, {});
   const Fit fitted = fit_of(p, drawing(4));
   const LeftOut all_left_out = leave_out(fitted.posterior, 0);
   const LeaveOneOut &left_out = all_left_out.values.front(), &row = all_left_out.rows.front();
@@ -304,7 +266,7 @@ TEST(HamiltonianTest, LeftOutValuesAreWeighedByWhatTheyDoToEachDraw) {
 }
 
 TEST(HamiltonianTest, DrawsWithoutAPosteriorAreLeftOutUnlessAllAreSuch) {
-  const DrawProblem p = only(make_problem(sloped_line(), 12, {"p", "r"}), Kind::parameter, Kind::parameter);
+  const DrawnProblem p = only(make_problem(sloped_line(), 12, {"p", "r"}), {Kind::parameter});
   FitReport report = fit_of(p, drawing(3)).report;
   const MatrixXd values = report.draws->values;
   const double largest = std::numeric_limits<double>::max();  // of which p x + r overflows

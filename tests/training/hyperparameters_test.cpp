@@ -296,9 +296,7 @@ directions = "acceleration"
 )toml",
                                    "cart");
   RandomStream random(hyperparameters_seed);
-  MatrixXd states(5, 10), values(2, 10);
-  for (double& entry : states.reshaped()) entry = random.normal();
-  for (double& entry : values.reshaped()) entry = random.normal();
+  const MatrixXd states = test::random_matrix(5, 10, random), values = test::random_matrix(2, 10, random);
   const std::vector<Observations> observations{
       {states, View::all(View::Quantity::constrained_acceleration, *model.system), values, VectorXd::Ones(2), false}};
   const Prior prior = make_prior(model);

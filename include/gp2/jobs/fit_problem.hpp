@@ -174,6 +174,7 @@ struct WholeLog {
   std::vector<std::string> missing;  // accelerations that are not in the log
   Eigen::MatrixXd stddev;            // of their noise, as the log or else [noise] states it; NaN where neither does (nq × N)
   std::vector<int> stated;           // rows of accelerations whose standard deviations the log states
+  bool reads_time = false;           // whether the model reads t
 };
 /// @throws InputError for a missing column that the model's prior reads, and as LogReader::stddevs.
 WholeLog read_whole_log(const Model& model, LogReader& reader);

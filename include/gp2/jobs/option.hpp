@@ -14,10 +14,10 @@
 
 namespace gp2 GP2_API {
 
-/// One word of several, for an enumeration.
+/// A value that is one word of a fixed set, for an enumeration.
 struct Choice {
   std::vector<std::string> words;
-  std::function<std::string()> get;             // the word chosen; empty: none
+  std::function<std::string()> get;             // the chosen word; empty: none
   std::function<void(const std::string&)> set;  // takes one of `words`
 };
 /// @param value  an enumeration, or an optional one
@@ -39,24 +39,24 @@ Choice choice(Value& value, const std::vector<std::pair<std::string, std::type_i
   return out;
 }
 
-/// Yes or no, by words where an option is written as text.
+/// A Boolean that is written as one of two words, such as on and off.
 struct Switch {
   bool* value;
   std::string on, off;
 };
 
-/// Yes unless a flag --no-NAME says otherwise.
+/// A Boolean that is true unless the flag --no-NAME is given.
 struct YesByDefault {
   bool* value;
 };
 
-/// A number, or a word that sets something else.
+/// A number, or one of several words, each of which sets a Boolean of its own.
 struct NumberOrWord {
   std::optional<double>* number;
   std::vector<std::pair<std::string, bool*>> words;
 };
 
-/// Numbers by name, from a file or as they are.
+/// Numbers by name, given directly or read from a file.
 struct NamedNumbers {
   std::string file;  // {"name": value, …} as JSON, or a FIT.json; empty: `values`
   std::map<std::string, double> values;
@@ -64,12 +64,12 @@ struct NamedNumbers {
   [[nodiscard]] bool empty() const { return file.empty() && values.empty(); }
 };
 
-/// Texts that are given one at a time: --data A.csv --data B.csv.
+/// Texts that are given by repeating the option: --data A.csv --data B.csv.
 struct Repeated {
   std::vector<std::string>* values;
 };
 
-/// Where the value of an option stands, and of what kind it is.
+/// Points to the value of an option; the alternative held is the kind of that value.
 using OptionValue =
     std::variant<bool*, int*, std::uint64_t*, double*, std::string*,                             //
                  std::optional<int>*, std::optional<std::uint64_t>*, std::optional<double>*,     //
@@ -90,15 +90,15 @@ Overloaded(Cases...) -> Overloaded<Cases...>;
 /// The default is the value of a new request.
 struct Option {
   std::string name;            // in snake_case: noise_std, which the command spells --noise-std
-  OptionValue value;           // where it stands in the request
-  std::string sample;          // what stands for a value in a usage line: S, ddq3,ddq6, FILE
-  std::string text;            // what it is, in a sentence
-  std::string otherwise = {};  // what holds where it is not given and the value does not say it
-  std::string keyword = {};    // Python's name where it is another
-  std::string flag = {};       // the command's where it is another: -o,--output; MODEL for an argument by position
-  std::string needs = {};      // another option without which it means nothing
+  OptionValue value;           // points to the value in the request
+  std::string sample;          // placeholder of the value in a usage line: S, ddq3,ddq6, FILE
+  std::string text;            // description, one sentence
+  std::string otherwise = {};  // description of the default, if the value of a new request does not show it
+  std::string keyword = {};    // keyword in Python, if it is not the name
+  std::string flag = {};       // flag of the command, if it is not the name: -o,--output; MODEL for a positional argument
+  std::string needs = {};      // another option that this one requires
   bool is_required = false;
-  bool is_recorded = true;  // in FIT.json: the result depends on it
+  bool is_recorded = true;  // whether FIT.json stores it, because the result depends on it
   std::string group = {};   // heading in --help; empty: Options
 };
 
@@ -113,37 +113,37 @@ inline std::vector<Option> joined(const std::vector<std::vector<Option>>& tables
   return all;
 }
 
-/// An option on which no result depends.
+/// The same option, not stored in FIT.json because no result depends on it.
 inline Option not_recorded(Option option) {
   option.is_recorded = false;
   return option;
 }
 
-/// "threads", alike in every job.
+/// The option `threads`, the same in every job.
 Option threads_option(int& threads);
-/// @throws InputError when it is negative.
+/// @throws InputError if it is negative.
 void require_threads(int threads);
-/// "map", in every job that reads a log.
+/// The option `map` of every job that reads a log.
 Option columns_option(std::map<std::string, std::string>& columns, const std::string& text = "columns by other names");
 
-/// The entry of a name; null where there is none.
+/// The option with this name; null if there is none.
 const Option* find_option(const std::vector<Option>& options, const std::string& name);
 
-/// The values of options as a JSON object. Those without a value are left out: not given, an empty list, a flag not set.
+/// The values of options as a JSON object. Options without a value are left out: not given, an empty list, a flag that is not set.
 std::string options_json(const std::vector<Option>& options);
 
-/// Reads options_json back.
-/// @param source  stands for the file in messages
-/// @throws InputError naming a key that is unknown, or has a value of the wrong kind.
+/// Sets options to values that options_json wrote.
+/// @param source  name of the file, for messages
+/// @throws InputError that names a key that is unknown or has a value of the wrong kind.
 void read_options(const std::string& json, const std::vector<Option>& options, const std::string& source);
 
-/// Messages below the faces name an option in backticks, by itself or with a value: `noise_std`, `noise_std=estimate`. A face
-/// respells them in its own way.
-/// @param spell  (name, value or nothing) -> its words
+/// The message with each option in the spelling of the command or of Python. The library names an option in backticks, alone or
+/// with a value: `noise_std`, `noise_std=estimate`.
+/// @param spell  (name, value if there is one) -> the spelling
 std::string respelled(const std::string& message,
                       const std::function<std::string(const std::string&, const std::optional<std::string>&)>& spell);
 
-/// A face's way, of a whole message.
+/// Gives the options in a whole message the spelling of the command or of Python.
 using Spelling = std::function<std::string(const std::string& message)>;
 
 }  // namespace gp2

@@ -80,6 +80,9 @@ struct PredictOutcome {
 /// @throws InputError where samples of a view at all states together take more
 void require_memory_of_samples(const Posterior& posterior, const View& view, Eigen::Index n_states, int n_samples,
                                std::optional<double> free);
+/// @param free  as free_memory(); nothing: no limit
+/// @throws InputError where the joint covariance of a view at all states takes more
+void require_memory_of_joint(const Posterior& posterior, const View& view, Eigen::Index n_states, std::optional<double> free);
 
 /// A note of states that are far from the data.
 /// @param distance  Posterior::distance_from_data

@@ -60,4 +60,8 @@ struct Resample {
 Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options,
                   const std::atomic<bool>* stop = nullptr);
 
+/// How well the chosen rows cover a log.
+/// @param name  stands for these rows
+std::vector<std::string> resample_notes(const Resample& chosen, const CsvTable& log, const std::string& name);
+
 }  // namespace gp2

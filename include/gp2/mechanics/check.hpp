@@ -77,6 +77,7 @@ struct ConstraintResidual {
   double expected = 0;     // of √(A S Aᵀ), root mean square; NaN where the noise S is not known
   double size = 0;         // of |A| |ddq| + |b|, root mean square
   std::vector<int> worst;  // states with the largest r, in units of the expected one where that is known; at most three
+  int n_outliers = 0;      // states, at most one in twenty, without which r is noise; 0: r is noise, or too large at many states
 
   /// Whether r is more than noise: more than twice what is expected, beyond what chance does to n values; where the noise is not
   /// known, an offset that stands out of the scatter, or half as large as the terms that should cancel.
