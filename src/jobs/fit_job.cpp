@@ -719,6 +719,11 @@ CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
 
 FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOutcome outcome = run_for_what_rows_are_worth(with_actuators(job, stop), progress, stop);
+  // what the model lacks from the start explains what its residuals say
+  if (const std::optional<std::string> note = note_of_unlearnable_force(job.problem.prior)) {
+    std::erase(outcome.notes, *note);
+    outcome.notes.insert(outcome.notes.begin(), *note);
+  }
   // a fit again from its file keeps what was said with the logs at hand
   outcome.file.notes = job.file.notes.value_or(outcome.notes);
   if (!outcome.cross_validation) outcome.file.notes.reset();

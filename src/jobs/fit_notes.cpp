@@ -447,23 +447,24 @@ void add_window_note(const Posterior& posterior, std::vector<std::string>& notes
                   factor));
 }
 
-void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {
-  Prior prior = posterior.prior();
-  const std::vector<Observations>& observations = posterior.observations();
-  if (prior.mean != Prior::Mean::zero || prior.reference) return;
+std::optional<std::string> note_of_unlearnable_force(const Prior& prior) {
+  if (prior.mean != Prior::Mean::zero || prior.reference) return std::nullopt;
   const std::vector<bool> known = prior.reads(), force = prior.system->reads(SystemPart::force);
   const std::vector<std::string> names = prior.system->state_names();
   std::vector<std::string> unknown;
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (force[k] && !known[k]) unknown.push_back(names[k]);
   }
-  if (!unknown.empty()) {
-    notes.push_back(
-        fmt::format("warning: the known force of [mechanics] is not used, and no feature reads {}, on which it depends: fit "
-                    "with `mean=force`",
-                    fmt::join(unknown, ", ")));
-    return;
-  }
+  if (unknown.empty()) return std::nullopt;
+  return fmt::format("warning: the known force of [mechanics] is not used, and no feature reads {}, on which it depends: fit with "
+                     "`mean=force`",
+                     fmt::join(unknown, ", "));
+}
+
+void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {
+  Prior prior = posterior.prior();
+  const std::vector<Observations>& observations = posterior.observations();
+  if (prior.mean != Prior::Mean::zero || prior.reference || note_of_unlearnable_force(prior)) return;
   bool is_zero = true;
   for (const Observations& group : observations) {
     if (group.view().other_system) return;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -76,8 +77,10 @@ void add_inducing_note(const InducingReport& inducing, std::vector<std::string>&
 // Where sums over windows of time deviate by far more than the noise of the positions makes them.
 void add_window_note(const Posterior& posterior, std::vector<std::string>& notes);
 
-// What this fit leaves out of the force that its model knows: that the latents cannot stand for it, or that the same data are far
-// more likely with it under the same hyperparameters.
+// A known force that is not used, and for which the latents cannot stand.
+std::optional<std::string> note_of_unlearnable_force(const Prior& prior);
+
+// Where they could: that the same data are far more likely with it under the same hyperparameters.
 void add_force_note(const Posterior& posterior, std::vector<std::string>& notes);
 
 }  // namespace gp2
