@@ -456,9 +456,10 @@ std::optional<std::string> note_of_unlearnable_force(const Prior& prior) {
     if (force[k] && !known[k]) unknown.push_back(names[k]);
   }
   if (unknown.empty()) return std::nullopt;
-  return fmt::format("warning: the known force of [mechanics] is not used, and no feature reads {}, on which it depends: fit with "
-                     "`mean=force`",
-                     fmt::join(unknown, ", "));
+  return fmt::format(
+      "warning: the known force of [mechanics] is not used, and no feature reads {}, on which it depends: fit with "
+      "`mean=force`",
+      fmt::join(unknown, ", "));
 }
 
 void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {
