@@ -3,7 +3,6 @@
 #include <functional>
 #include <limits>
 #include <numeric>
-#include <ranges>
 #include <utility>
 
 #include <fmt/format.h>
@@ -227,8 +226,8 @@ class RowResiduals {
     std::ranges::sort(farthest_, std::greater());
     const std::size_t most_outliers = (static_cast<std::size_t>(sums_.n) + farthest_.size()) / one_in;
     std::vector<ConstraintResidual> without_first{means()};  // without all of the farthest, …, without none
-    for (const StateResidual& one : std::views::reverse(farthest_)) {
-      add_to_sums(one);
+    for (auto one = farthest_.rbegin(); one != farthest_.rend(); ++one) {
+      add_to_sums(*one);
       without_first.push_back(means());
     }
     ConstraintResidual all = without_first.back();

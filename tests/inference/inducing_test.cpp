@@ -272,12 +272,12 @@ TEST(Inducing, AllOfManyStatesAreLearnedFromAndSomeAreKept) {
 // A fast move of a few states among many slow ones, of which those taken evenly are none.
 TEST(Inducing, WhatIsRareHasPointsOfItsOwn) {
   Problem p = of_many_states(4'000);
-  const Observations& all = p.observations.front();
-  MatrixXd states = all.states();
+  const Observations& given = p.observations.front();
+  MatrixXd states = given.states();
   const MatrixXd fast = states.middleCols(1'001, 9);
   states *= 0.02;
   states.middleCols(1'001, 9) = fast;
-  p.observations = {Observations(states, all.view(), all.values(), all.noise())};
+  p.observations = {Observations(states, given.view(), given.values(), given.noise())};
   const InducingOptions options{.n_candidates = 400};
   const auto left_out = [&](const InducingChoice& choice) {
     p.values.inducing = choice.points;
