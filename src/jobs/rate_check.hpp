@@ -30,8 +30,8 @@ std::string better_rate(const RateColumns& columns);
 /// their velocities, a sentence each. Empty where t is not known.
 /// @param states         (layout size × N)
 /// @param accelerations  (nq × N); NaN: not measured
-/// @param reads_time     whether the model reads t, which then is in seconds. Else it may be in milli-, micro- or nanoseconds too: in the
-///                       unit under which the fewest columns are wrong.
+/// @param reads_time     whether the model reads t, which then is in seconds. Else t may be in ms, µs or ns too: in the unit under
+///                       which the fewest columns are wrong.
 std::vector<std::string> wrong_rates(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                      const Eigen::Ref<const Eigen::MatrixXd>& accelerations, bool reads_time);
 
