@@ -14,6 +14,7 @@
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/view.hpp"
+#include "interruption.hpp"
 #include "streams.hpp"
 
 namespace gp2::command {
@@ -255,8 +256,9 @@ void run(const SimulateArguments& arguments) {
   print_notes(job.notes);
   std::vector<Trajectory> trajectories;
   std::string unfinished;
+  const Interruption interruption;
   try {
-    trajectories = run_simulation(job);
+    trajectories = run_simulation(job, interruption.stop());
   } catch (const UnfinishedMotion& motion) {
     trajectories = motion.motions;
     unfinished = motion.what();
@@ -269,7 +271,12 @@ void run(const SimulateArguments& arguments) {
   });
   print_notes(notes_of(motions, subject.system(), job, arguments));
   if (arguments.json) print_json(report_of(motions, subject.system(), job));
-  if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds the motion up to there", unfinished, arguments.output));
+  if (unfinished.empty()) return;
+  if (interruption.signal() == 0) {
+    throw NumericalError(fmt::format("{}; {} holds the motion up to there", unfinished, arguments.output));
+  }
+  print_notes({fmt::format("{}: {} holds the motion up to there", interruption.text(), arguments.output)});
+  throw Interrupted{interruption.signal()};
 }
 
 }  // namespace

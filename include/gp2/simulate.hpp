@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <functional>
 #include <span>
 #include <string>
@@ -135,6 +136,7 @@ struct SimulateOptions {
   PushedAcceleration pushed;         // what says how the friction of an impact follows from its load; none: it has no friction
   Acceleration record;               // another function of the state, of any size, that is wanted at the times; none
   double initial_step = 0;           // [s]; 0: found from the first two accelerations
+  const std::atomic<bool>* stop = nullptr;  // once set the motion ends with its next step
 };
 
 /// A motion at the times asked for.
@@ -200,7 +202,7 @@ class UnfinishedMotion : public NumericalError {
 ///                    it is without `project`; the trajectory reports both.
 /// @throws InputError when sizes, times or tolerances are wrong.
 /// @throws UnfinishedMotion with the time, when a projection does not converge, the acceleration is not finite or cannot be
-///   computed, the step size underflows, or max_steps is reached.
+///   computed, the step size underflows, max_steps is reached, or it was to stop.
 Trajectory simulate(const System& system, const Eigen::VectorXd& parameters, const Acceleration& acceleration,
                     const Eigen::Ref<const Eigen::VectorXd>& start, const SimulateOptions& options);
 

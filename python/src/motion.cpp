@@ -80,27 +80,26 @@ SimulateRequest simulate_request(const System& system, const py::object& start, 
   return request;
 }
 
-/// Throws a gp2.NumericalError with what was reached as its attribute `motion`.
-[[noreturn]] void raise_unfinished(const std::string& text, const py::object& motion) {
-  const py::object type = py::module_::import("gp2._gp2").attr("NumericalError"), error = type(with_keywords(text));
-  error.attr("motion") = motion;
-  PyErr_SetObject(type.ptr(), error.ptr());
-  throw py::error_already_set();
+std::exception_ptr numerical_error(const std::string& text) {
+  const py::object type = py::module_::import("gp2._gp2").attr("NumericalError");
+  PyErr_SetObject(type.ptr(), type(with_keywords(text)).ptr());
+  return std::make_exception_ptr(py::error_already_set());
 }
 
 using Uncertainty = std::function<MotionUncertainty(const Trajectory&)>;
 
-/// The motions of a job, one after the other: a Motion, or a list of them; Ctrl-C ends them.
-/// @throws as raise_unfinished, where one cannot go on
+/// The motions of a job, one after the other: a Motion, or a list of them; Ctrl-C ends them. What is raised where one cannot go on,
+/// or by Ctrl-C, has what was reached as its attribute `motion`.
 py::object run_motions(const SimulateJob& job, bool are_many, const Uncertainty& uncertainty) {
   tell(job.notes);
   std::vector<Trajectory> trajectories;
-  std::string unfinished;
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
   try {
-    trajectories = run_or_raise([&](const std::atomic<bool>* stop) { return run_simulation(job, stop); });
+    trajectories = run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {});
   } catch (UnfinishedMotion& error) {
     trajectories = std::move(error.motions);
-    unfinished = error.what();
+    if (!raised) raised = numerical_error(error.what());
     if (trajectories.back().times.size() == 0) trajectories.pop_back();  // it did not begin
   }
   std::vector<SimulatedMotion> motions;
@@ -114,7 +113,7 @@ py::object run_motions(const SimulateJob& job, bool are_many, const Uncertainty&
   py::list out;
   for (SimulatedMotion& motion : motions) out.append(named(std::move(motion), *job.system, job.options.switching));
   const py::object result = are_many ? py::object(out) : out.empty() ? py::none() : py::object(out[0]);
-  if (!unfinished.empty()) raise_unfinished(unfinished, result);
+  if (raised) raise_with(raised, "motion", result);
   return result;
 }
 

@@ -246,10 +246,8 @@ class Search {
     Candidate out{.coefficients = std::move(coefficients), .violation = boundless};
     try {
       out.motion = run_simulation(job, stop_).front();
-    } catch (const SimulationStopped&) {
-      return out;
     } catch (const NumericalError& error) {
-      out.failure = error.what();
+      if (stop_ == nullptr || !*stop_) out.failure = error.what();
       return out;
     }
     out.violation = 0;

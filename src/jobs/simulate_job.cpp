@@ -394,16 +394,13 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
 std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop) {
   std::vector<Trajectory> motions;
   SimulateOptions options = job.options;
+  options.stop = stop;
   for (const SimulateJob::Motion& motion : job.motions) {
-    const Acceleration stoppable = [&](const Eigen::Ref<const VectorXd>& x) {
-      if (stop != nullptr && *stop) throw SimulationStopped();
-      return motion.acceleration(x);
-    };
     options.record = motion.multipliers;
     options.contacts = motion.contacts;
     options.pushed = motion.pushed;
     try {
-      motions.push_back(simulate(*job.system, motion.parameters, stoppable, job.start, options));
+      motions.push_back(simulate(*job.system, motion.parameters, motion.acceleration, job.start, options));
     } catch (UnfinishedMotion& unfinished) {
       const std::string which = job.motions.size() > 1 ? fmt::format("sample {}: ", motions.size()) : "";
       motions.push_back(std::move(unfinished.motions.front()));

@@ -170,6 +170,7 @@ class Integration {
   }
 
   void require_progress() {
+    if (options_.stop != nullptr && *options_.stop) throw NumericalError(fmt::format("simulate: stopped at t = {:.6g}", t_));
     const int taken = out_.steps + out_.rejected_steps;
     if (taken <= options_.max_steps / 2) t_halfway_ = t_;
     if (taken >= options_.max_steps) {

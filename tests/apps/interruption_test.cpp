@@ -107,6 +107,22 @@ TEST_P(Interrupted, AFitSavesTheBestSoFarAndSaysSo) {
   EXPECT_LE(desk.done(again).json()["nll"], saved.report.negative_log_likelihood + 1);
 }
 
+TEST_P(Interrupted, ASimulationSavesTheMotionUpToThere) {
+  const Desk desk;
+  Running simulation(desk, {"simulate", "models/duffing.toml", "--start", "q1=0.1,q2=0.3,dq1=0.2,dq2=0", "--t-end", "1e6", "--dt", "1",
+                            "-o", "motion.csv"});
+  simulation.wait_until_it_handles(GetParam());
+  Running::pause(0.5);
+  simulation.send(GetParam());
+  const int status = simulation.end();
+  ASSERT_TRUE(WIFEXITED(status)) << "killed by " << WTERMSIG(status);
+  EXPECT_EQ(WEXITSTATUS(status), 128 + GetParam()) << simulation.err();
+  EXPECT_THAT(simulation.err(), HasSubstr("gp2: interrupted by signal " + std::to_string(GetParam()) + " ("));
+  EXPECT_THAT(simulation.err(), HasSubstr("): motion.csv holds the motion up to there"));
+  const CsvTable motion = CsvTable::read(desk / "motion.csv");
+  ASSERT_GT(motion.n_rows(), 2);
+}
+
 TEST(InterruptedTwice, AFitEndsAtOnceAndLeavesTheOldFile) {
   const Desk desk;
   desk.done("gp2 generate models/surface.toml --n 1500 -o train.csv");

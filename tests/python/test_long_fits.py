@@ -85,8 +85,9 @@ def test_ctrl_c_ends_a_simulation():
         posterior = gp2.fit(system, system.generate(50), mean="force", max_iterations=0)
         threading.Timer(0.3, print, ["ready"], {"flush": True}).start()
         try:
-            posterior.simulate([0.5, 0], [0, 1e5], rtol=1e-10)
-        except KeyboardInterrupt:
+            posterior.simulate([0.5, 0], [0, 1e-2, 1e5], rtol=1e-10)
+        except KeyboardInterrupt as stop:
+            assert stop.motion.t[1] == 1e-2 < stop.motion.t[2] < 1e5
             print("stopped")
         """
     )

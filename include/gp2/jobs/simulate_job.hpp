@@ -76,11 +76,8 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
 /// The motion of the mean of a posterior, or of samples, as a system of its fit moves.
 SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request);
 
-/// Thrown by run_simulation when it is asked to end.
-struct SimulationStopped {};
-
 /// One motion after the other, λ recorded where there are constraints.
-/// @param stop  set: throws SimulationStopped
+/// @param stop  once set the motion ends as one that cannot go on
 /// @throws UnfinishedMotion with what was reached of all motions.
 std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop = nullptr);
 
