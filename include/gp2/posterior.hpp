@@ -152,6 +152,7 @@ class Posterior {
   friend Posterior update(Posterior&& posterior, Observations added);
   friend struct LeftOut leave_out(const Posterior& posterior, int n_stretches);
   friend struct CSource export_c(const Posterior& posterior, const View& view, const struct CSourceOptions& options);
+  friend void set_prior(Posterior& posterior, const Prior& prior);
   friend Posterior remove_oldest(Posterior&& posterior, int n);
   friend Posterior forget(Posterior&& posterior, double share);
 
@@ -184,6 +185,10 @@ class Posterior {
 /// @throws InputError when the states are not as large as those of the system, and as the constructor; it and
 /// NumericalError leave `posterior` as it was. Otherwise it is empty, as after any move.
 [[nodiscard]] Posterior update(Posterior&& posterior, Observations added);
+
+/// Gives a posterior another prior whose latents differ only at states where nothing was observed, as the discrepancy does whose range
+/// grows (T23): nothing is conditioned anew. That they are the same at the observed states is not checked. In place as update.
+void set_prior(Posterior& posterior, const Prior& prior);
 
 /// The posterior in which the likelihood of all observations so far counts as its power `share`, 0 < share ≤ 1: before each update
 /// what is old fades, as where a machine wears. Through inducing points only; O(M³). In place and otherwise as update.

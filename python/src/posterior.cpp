@@ -270,7 +270,8 @@ Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, c
   const EvaluateRequest request{names_or_all(outputs, "outputs"), model_of(system), columns_argument(columns), n_threads};
   const CsvTable table = to_table(data, "data");
   const PyPosterior held = self;
-  EvaluateOutcome outcome = unlocked([&] { return evaluate(held.file, held.posterior, table, request); });
+  EvaluateOutcome outcome =
+      run_or_raise([&](const std::atomic<bool>* stop) { return evaluate(held.file, held.posterior, table, request, stop); });
   tell(outcome.notes);
   return std::move(outcome.evaluation);
 }
@@ -321,7 +322,9 @@ void add_observations(PyPosterior& self, Observations more, const CsvTable& log,
     return;
   }
   // a step that is refused undoes those before it
-  const auto undo = [&file, draws = file.report.draws, logs = file.logs, source = file.data_source, said = file.notes] {
+  const auto undo = [&file, prior = file.prior_options, draws = file.report.draws, logs = file.logs, source = file.data_source,
+                     said = file.notes] {
+    file.prior_options = prior;
     file.report.draws = draws;
     file.notes = said;
     file.logs = logs;

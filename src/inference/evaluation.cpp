@@ -446,6 +446,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   const VectorXd distance = posterior.distance_from_data(all, states, options.n_threads);
   Scores whole(e.rmse.size()), near(e.rmse.size()), far(e.rmse.size());
   posterior.for_each_marginal(all, states, options.n_threads, [&](Index first, const Posterior::Marginal& prediction) {
+    if (options.stop != nullptr && *options.stop) throw NumericalError("stopped on request");
     const MatrixXd stddev = prediction.stddev();
     for (Index i = 0; i < stddev.cols(); ++i) {
       const Index state = first + i;

@@ -127,6 +127,12 @@ Posterior update(Posterior&& posterior, Observations added) {
   return Posterior(Posterior::Components(own.begin(), own.end()));
 }
 
+void set_prior(Posterior& posterior, const Prior& prior) {
+  const auto own = posterior.own_components();
+  for (const auto& component : own) component->prior = prior;
+  posterior.components_.assign(own.begin(), own.end());
+}
+
 Posterior forget(Posterior&& posterior, double share) {
   if (!(share > 0 && share <= 1)) throw InputError(fmt::format("`forget`: a share is above 0 and at most 1, got {}", share));
   if (!posterior.implementation().kept) {

@@ -373,7 +373,8 @@ std::vector<Option> options(EvaluateRequest& request) {
           threads_option(request.threads)};
 }
 
-EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request) {
+EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request,
+                         const std::atomic<bool>* stop) {
   require_threads(request.threads);
   EvaluateOutcome out;
   ViewRequest constrained;
@@ -387,7 +388,7 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
   log = CsvTable();
-  EvaluationOptions options{at.view.other_system, {}, request.threads};
+  EvaluationOptions options{at.view.other_system, {}, request.threads, stop};
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
   out.evaluation =
       at_states_of(name, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });

@@ -274,6 +274,26 @@ Posterior update_where_possible(Posterior&& posterior, FitReport& report, const 
   }
 }
 
+// The discrepancy grows outside the data (T23), where from now on there are some: its range becomes that of all rows. At those before
+// nothing changes, so that nothing is conditioned anew. Discrepancies of other systems keep their range, and here it does too then.
+void extend_range(Posterior& posterior, FitFile& fit, const Observations& more) {
+  const std::vector<Observations>& groups = posterior.observations();
+  const bool has_other_systems =
+      std::ranges::any_of(groups, [](const Observations& group) { return group.view().other_system != nullptr; });
+  if (!fit.prior_options.discrepancy || fit.prior_options.discrepancy->half_range.size() == 0 || has_other_systems) return;
+  Discrepancy extended = *fit.prior_options.discrepancy;
+  const MatrixXd scaled = posterior.prior().latents.back().features->evaluate(more.states(), VectorXd());
+  const MatrixXd features = extended.lengthscale.asDiagonal() * scaled.topRows(extended.lengthscale.size());
+  const VectorXd lowest = features.rowwise().minCoeff().cwiseMin(extended.centre - extended.half_range);
+  const VectorXd highest = features.rowwise().maxCoeff().cwiseMax(extended.centre + extended.half_range);
+  const bool is_within = ((highest - lowest) / 2 - extended.half_range).maxCoeff() <= 0;
+  if (is_within) return;
+  extended.centre = (highest + lowest) / 2;
+  extended.half_range = (highest - lowest) / 2;
+  fit.prior_options.discrepancy = std::move(extended);
+  set_prior(posterior, fit.prior());
+}
+
 }  // namespace
 
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
@@ -336,6 +356,7 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   const double before = left_out(posterior);
   const auto n_before = static_cast<double>(posterior.n_states());
   const int n_more = more.n_data(), n_draws = posterior.n_components();
+  if (n_more > 0) extend_range(posterior, fit, more);
   Posterior all = update_where_possible(std::move(posterior), fit.report, more);
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
   if (n_more > 0) fit.notes.reset();

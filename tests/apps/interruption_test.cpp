@@ -109,8 +109,8 @@ TEST_P(Interrupted, AFitSavesTheBestSoFarAndSaysSo) {
 
 TEST_P(Interrupted, ASimulationSavesTheMotionUpToThere) {
   const Desk desk;
-  Running simulation(desk, {"simulate", "models/duffing.toml", "--start", "q1=0.1,q2=0.3,dq1=0.2,dq2=0", "--t-end", "1e6", "--dt", "1",
-                            "-o", "motion.csv"});
+  Running simulation(desk,
+                     {"simulate", "models/duffing.toml", "--start", "q1=0.4", "--t-end", "1e6", "--dt", "1", "-o", "motion.csv"});
   simulation.wait_until_it_handles(GetParam());
   Running::pause(0.5);
   simulation.send(GetParam());
@@ -193,17 +193,13 @@ TEST(InterruptedOnce, OtherCommandsLeaveTheOldFile) {
   desk.done("gp2 generate models/duffing.toml --n 100 -o train.csv");
   desk.write("old.csv", "what was here before\n");
   const std::set<std::string> before = files(desk);
-  for (const std::vector<std::string>& line :
-       {std::vector<std::string>{"simulate", "models/duffing.toml", "--start", "q1=0.4", "--t-end", "1e7", "-o", "old.csv"},
-        {"generate", "models/surface.toml", "--n", "10000000", "-o", "old.csv"}}) {
-    Running command(desk, line);
-    Running::pause(0.5);
-    command.send(SIGTERM);
-    const int status = command.end();
-    ASSERT_TRUE(WIFSIGNALED(status)) << command.err();
-    EXPECT_EQ(desk.read("old.csv"), "what was here before\n");
-    EXPECT_EQ(files(desk), before);
-  }
+  Running command(desk, {"generate", "models/surface.toml", "--n", "10000000", "-o", "old.csv"});
+  Running::pause(0.5);
+  command.send(SIGTERM);
+  const int status = command.end();
+  ASSERT_TRUE(WIFSIGNALED(status)) << command.err();
+  EXPECT_EQ(desk.read("old.csv"), "what was here before\n");
+  EXPECT_EQ(files(desk), before);
 }
 
 }  // namespace

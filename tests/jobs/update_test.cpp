@@ -55,10 +55,42 @@ TEST(UpdateJob, AFitOfMoreIsThatOfAllUnderTheSameHyperparameters) {
   const Posterior read = FitFile::read(folder / "fit.json").posterior();
   EXPECT_EQ(read.observations().size(), 1u) << "of one noise";
   EXPECT_EQ(read.observations().front().n_data(), 45);
-  const Posterior grown = update(update(fit.posterior(), more_of(fit, log_of(10, 2))), more_of(fit, log_of(5, 3)));
+  FitFile of_grown = fit;
+  Posterior grown = fit.posterior();
+  std::vector<std::string> notes;
+  for (const CsvTable& log : {log_of(10, 2), log_of(5, 3)}) {
+    Observations more = more_observations(of_grown, grown, log, {}, notes);
+    grown = with_more(std::move(grown), of_grown, std::move(more), log, notes);
+  }
   const View view = View::constrained_acceleration(*fit.model.system);
   const MatrixXd states = read.observations().front().states(), mean = grown.mean(view, states);
   EXPECT_LE((read.mean(view, states) - mean).cwiseAbs().maxCoeff(), 1e-8 * mean.cwiseAbs().maxCoeff());
+}
+
+// T23: outside the data the discrepancy is larger, but rows that are added are data.
+TEST(UpdateJob, TheRangeOfTheDiscrepancyBecomesThatOfAllRows) {
+  const FitFile fit = fit_of(log_of(30, 1));
+  Model fast = test::model(surface);
+  for (Model::SamplingRule& rule : fast.sampling) {
+    if (rule.name.starts_with("dq")) rule.range = {{-1.5, 1.5}};
+  }
+  const CsvTable log = test::drawn_log(fast, 20, 2).table();
+  const MatrixXd states = more_of(fit, log).states();
+  const auto growth = [&](const FitFile& of) {
+    return of.prior().latents.back().features->evaluate(states, Eigen::VectorXd()).bottomRows(1).eval();
+  };
+  ASSERT_GT(growth(fit).maxCoeff(), 1);
+  FitFile updated = fit;
+  std::vector<std::string> notes;
+  const Posterior grown = with_more(fit.posterior(), updated, more_of(fit, log), log, notes);
+  EXPECT_EQ(growth(updated).maxCoeff(), 0);
+
+  // as if all were conditioned anew under the prior that the file now has
+  updated.take_data(grown);
+  const View view = View::constrained_acceleration(*fit.model.system);
+  const Posterior::Marginal in_place = grown.marginal(view, states), anew = updated.posterior().marginal(view, states);
+  EXPECT_LE((in_place.mean - anew.mean).cwiseAbs().maxCoeff(), 1e-8 * anew.mean.cwiseAbs().maxCoeff());
+  EXPECT_LE((in_place.stddev() - anew.stddev()).cwiseAbs().maxCoeff(), 1e-6 * anew.stddev().maxCoeff());
 }
 
 TEST(UpdateJob, AWindowLeavesTheNewest) {

@@ -166,17 +166,19 @@ def test_ctrl_c_ends_what_goes_through_a_long_log(work):
     assert seconds < PATIENCE
 
 
-def test_ctrl_c_ends_a_large_prediction():
+@pytest.mark.parametrize("work", ["posterior.predict(states, threads=1)", "posterior.evaluate(log, threads=1)"])
+def test_ctrl_c_ends_a_large_prediction(work):
     out, err, status, seconds = interrupted(
-        """
+        f"""
         import sys, threading, numpy as np, gp2
         system = gp2.System.load(sys.argv[1] + "/surface.toml")
         posterior = gp2.fit(system, system.generate(200), max_iterations=0)
         states = np.tile(system.states(system.generate(100)), (3000, 1))
         states[:, system.state_names.index("t")] = 0
-        threading.Timer(0.3, print, ["ready"], {"flush": True}).start()
+        log = dict(zip(system.state_names, states.T)) | {{f"ddq{{k}}": states[:, 0] for k in (1, 2, 3)}}
+        threading.Timer(0.3, print, ["ready"], {{"flush": True}}).start()
         try:
-            posterior.predict(states, threads=1)
+            {work}
         except KeyboardInterrupt:
             print("stopped")
         """

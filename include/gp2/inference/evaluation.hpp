@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <memory>
 #include <optional>
 #include <string>
@@ -70,8 +71,9 @@ Eigen::MatrixXd with_slip(const Posterior& posterior, const View& view, const Ei
 
 struct EvaluationOptions {
   std::shared_ptr<const OtherSystem> other_system = nullptr;  // under which the targets were measured; null: the prior's own
-  Eigen::MatrixXd noise_stddev = {};  // of the targets (rows × N); NaN: not known; empty: measurement_noise. Without slip
-  int n_threads = 1;                  // as in Posterior::marginal
+  Eigen::MatrixXd noise_stddev = {};        // of the targets (rows × N); NaN: not known; empty: measurement_noise. Without slip
+  int n_threads = 1;                        // as in Posterior::marginal
+  const std::atomic<bool>* stop = nullptr;  // once set it ends with a NumericalError
 };
 
 /// @param states   (layout size × N)

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 #include <map>
 #include <memory>
@@ -116,6 +117,8 @@ struct EvaluateOutcome {
 };
 
 /// Compares predictions with measured or true accelerations.
-EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request);
+/// @param stop  as in EvaluationOptions
+EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request,
+                         const std::atomic<bool>* stop = nullptr);
 
 }  // namespace gp2
