@@ -219,6 +219,12 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False), None)
         # scikit-learn would compare number and order of the columns with those of fit, but the system says what they are
         given = _column_names("X", X)
+        names, fitted = list(self.system_.state_names), list(getattr(self, "feature_names_in_", ()))
+        if given is None and len(fitted) == len(names) and fitted != names:
+            warnings.warn(
+                f"X has no column names and is read as {', '.join(names)}, but fit was given {', '.join(fitted)}",
+                stacklevel=3,
+            )
         return self._states(check_array(_without_mask(X), dtype=np.float64, estimator=self, input_name="X"), given)
 
     def _rows_of_view(self) -> list[int]:

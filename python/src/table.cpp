@@ -34,7 +34,7 @@ CsvTable::Column to_column(std::string name, const py::object& values, const std
   }
   CsvTable::Column column{std::move(name), {}};
   const char kind = array.dtype().kind();
-  if (kind == 'f' || kind == 'i' || kind == 'u') {
+  if (kind == 'f' || kind == 'i' || kind == 'u' || kind == 'b') {
     const auto numbers = py::array_t<double, py::array::c_style | py::array::forcecast>::ensure(array);
     if (!numbers) throw std::bad_alloc();
     column.numbers.assign(numbers.data(), numbers.data() + numbers.size());
@@ -58,10 +58,15 @@ CsvTable make_table(const py::object& columns, const std::optional<std::string>&
   return !name || *name == table.name() ? table : CsvTable::parse(table.text(), *name);
 }
 
-py::array column_of(const CsvTable& table, const std::string& name) {
+py::object column_of(const CsvTable& table, const std::string& name) {
   const int column = table.find(name);
   if (column < 0) {
     throw py::key_error(fmt::format("{} has no column '{}'; it has: {}", table.name(), name, fmt::join(table.header(), ", ")));
+  }
+  if (table.is_text(column)) {
+    py::list cells;
+    for (int i = 0; i < table.n_rows(); ++i) cells.append(table.cell(i, column));
+    return py::module_::import("numpy").attr("array")(cells);
   }
   Eigen::VectorXd values(table.n_rows());
   for (int i = 0; i < table.n_rows(); ++i) values[i] = table.number_or_empty(i, column);
@@ -112,9 +117,8 @@ void add_table(py::module_& module) {
              return py::isinstance<py::str>(name) && table.find(name.cast<std::string>()) >= 0;
            })
       .def("__getitem__", &column_of, py::arg("name"),
-           "A column (n,), NaN where the cell is empty.\n\nRaises KeyError when there is none, InputError when a cell is "
-           "something "
-           "else than a finite number.")
+           "A column (n,), NaN where the cell is empty; of strings where no cell is a number.\n\nRaises KeyError when there is "
+           "none, InputError when some cells are numbers and one is not.")
       // names and cells of a file need not be UTF-8
       .def(py::pickle([](const CsvTable& table) { return py::make_tuple(py::bytes(table.name()), py::bytes(table.text())); },
                       [](const py::tuple& state) {

@@ -74,6 +74,9 @@ Parsed parse_number(std::string_view cell) {
   // from_chars knows no plus sign
   if (digits.starts_with('+') && !digits.starts_with("+-")) digits.remove_prefix(1);
   Parsed parsed;
+  for (const auto& [word, value] : {std::pair("True", 1.0), std::pair("False", 0.0)}) {
+    if (digits == word) return {value, true, std::errc()};
+  }
   const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), parsed.value);
   parsed.is_whole = end == digits.data() + digits.size();
   parsed.error = error;
@@ -671,6 +674,15 @@ const std::optional<LogFile>& CsvTable::file() const { return content_->file; }
 const std::vector<std::string>& CsvTable::header() const { return content_->header; }
 
 int CsvTable::n_rows() const { return static_cast<int>(content_->lines.size()); }
+
+bool CsvTable::is_text(int column) const {
+  bool has_text = false;
+  for (int row = 0; row < n_rows(); ++row) {
+    if (!std::isnan(content_->number(row, column))) return false;
+    has_text = has_text || !is_empty(row, column);
+  }
+  return has_text;
+}
 
 int CsvTable::line(int row) const { return content_->lines[static_cast<std::size_t>(row)]; }
 

@@ -8,6 +8,7 @@
 #include <fmt/format.h>
 
 #include "base/number_range.hpp"
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -152,19 +153,32 @@ void Observations::require_no_sums() const {
   if (has_sums()) throw InputError("observations that have sums over states neither grow nor shrink: condition on others anew");
 }
 
+namespace {
+
+void require_states(int first, int n, int n_all) {
+  if (first >= 0 && n >= 0 && n <= n_all - first) return;
+  throw InputError(fmt::format("observations: {} states from number {} on are asked for, of {}", n, first, n_all));
+}
+
+}  // namespace
+
 Observations Observations::take(const std::vector<int>& states) const {
   require_no_sums();
+  for (const int i : states) require_states(i, 1, n_data());
   return {MatrixXd(this->states()(Eigen::all, states)), view_, MatrixXd(values()(Eigen::all, states)), noise_.take(states)};
 }
 
 Observations Observations::slice(int first, int n) const {
   require_no_sums();
+  require_states(first, n, n_data());
   return {MatrixXd(states().middleCols(first, n)), view_, MatrixXd(values().middleCols(first, n)), noise_.slice(first, n)};
 }
 
 void Observations::append(const Observations& more) {
   require_no_sums();
   more.require_no_sums();
+  require_shape("observations: states that are added", more.states(), states().rows(), more.n_data());
+  require_shape("observations: values that are added", more.values(), values().rows(), more.n_data());
   noise_.append(more.noise_);
   append_columns(states_.change(), more.states());
   append_columns(values_.change(), more.values());
@@ -172,6 +186,7 @@ void Observations::append(const Observations& more) {
 
 void Observations::remove_first(int n) {
   if (n > 0) require_no_sums();
+  require_states(0, n, n_data());
   erase_first_columns(states_.change(), n);
   erase_first_columns(values_.change(), n);
   noise_.remove_first(n);

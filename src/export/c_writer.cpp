@@ -34,12 +34,14 @@ const std::set<std::string>& taken_names() {
 
 bool is_identifier(const std::string& text) {
   const auto is_letter = [](char c) { return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_'; };
-  return !text.empty() && is_letter(text.front()) && !taken_names().contains(text) &&
+  return !text.empty() && text != "_" && is_letter(text.front()) && !taken_names().contains(text) &&
          std::all_of(text.begin(), text.end(), [&](char c) { return is_letter(c) || (c >= '0' && c <= '9'); });
 }
 
 std::string in_comment(std::string text) {
-  for (std::size_t at = text.find("*/"); at != std::string::npos; at = text.find("*/", at)) text.replace(at, 2, "* /");
+  for (const auto& [mark, apart] : {std::pair("*/", "* /"), std::pair("/*", "/ *")}) {
+    for (std::size_t at = text.find(mark); at != std::string::npos; at = text.find(mark, at)) text.replace(at, 2, apart);
+  }
   return text;
 }
 
@@ -244,9 +246,7 @@ void Writer::set_sizes() {
       {"smallest_row", single ? "1.17549435e-38f" : "2.2250738585072014e-308"},
       {"if_singular", what_needs_acceleration(prior_, view_) ? "NO_UNCONSTRAINED_ACCELERATION" : "OK"},
   };
-  std::string guard = options_.name + "_H";
-  std::transform(guard.begin(), guard.end(), guard.begin(), [](unsigned char c) { return std::toupper(c); });
-  text("guard") = guard;
+  text("guard") = options_.name + "_H";  // names may differ in the case of their letters
 }
 
 std::string Writer::number(double value) const {

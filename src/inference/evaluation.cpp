@@ -10,6 +10,7 @@
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "base/shape.hpp"
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/leave_one_out.hpp"
@@ -211,6 +212,7 @@ MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& r
 
 MatrixXd with_slip(const Posterior& posterior, const View& view, const Ref<const MatrixXd>& states, MatrixXd noise_stddev) {
   const Prior& prior = prior_of(posterior.prior(), view);
+  require_shape("with_slip: noise_stddev", noise_stddev, view.size(), states.cols());
   if (!prior.system->has_constraint_noise()) return noise_stddev;
   const VectorXd parameters = parameters_of(view, posterior.values().parameters);
   const auto fault = for_each_mechanics(*prior.system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
@@ -424,14 +426,11 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   View compared = all;
   compared.rows = rows;
   require_view(posterior.prior(), compared);
-  const auto require_shape = [&](const char* what, Index n_rows, Index n_columns) {
-    if (n_rows == std::ssize(rows) && n_columns == states.cols()) return;
-    throw InputError(fmt::format("evaluate_predictions: {} must be {} × {}, got {} × {}", what, rows.size(), states.cols(),
-                                 n_rows, n_columns));
-  };
   const MatrixXd& given_noise = options.noise_stddev;
-  require_shape("targets", targets.rows(), targets.cols());
-  if (given_noise.size() > 0) require_shape("noise_stddev", given_noise.rows(), given_noise.cols());
+  require_shape("evaluate_predictions: targets", targets, std::ssize(rows), states.cols());
+  if (given_noise.size() > 0) {
+    require_shape("evaluate_predictions: noise_stddev", given_noise, std::ssize(rows), states.cols());
+  }
   const Prior& prior = prior_of(posterior.prior(), all);
   const System& system = prior.reference_system();
   const VectorXd parameters = parameters_of(all, posterior.values().parameters);

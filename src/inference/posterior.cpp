@@ -447,6 +447,8 @@ const Prior& Posterior::prior() const { return held().front()->prior; }
 const std::vector<Observations>& Posterior::observations() const { return held().front()->observations; }
 const ModelValues& Posterior::values() const { return held().front()->values; }
 VectorXd Posterior::noise_stddev(std::size_t g) const {
+  const std::size_t n = values().noise_stddev.size();
+  if (g >= n) throw InputError(fmt::format("noise_stddev: there is no group {} of observations, of which there are {}", g, n));
   VectorXd out = values().noise_stddev[g];
   if (held().size() == 1) return out;
   out.setZero();

@@ -98,7 +98,9 @@ Status Predictor::for_each_component(Workspace& workspace, Ref<VectorXd>& mean, 
     mean += w.mean;
   }
   mean /= static_cast<double>(components_.size());
-  return Status::ok;
+  if (is_finite(mean)) return Status::ok;  // else the sum overflows
+  mean.setConstant(not_a_number);
+  return Status::not_finite;
 }
 
 Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Workspace& workspace) const {

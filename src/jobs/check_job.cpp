@@ -296,6 +296,7 @@ void check_turns(const WholeLog& log, const System& system, int j, std::vector<F
   const StateLayout layout = system.layout();
   const auto t = log.states.row(layout.t()), q = log.states.row(layout.q(j)), dq = log.states.row(layout.dq(j));
   const Eigen::Index n = t.size() - 1;
+  if (!q.hasNaN() && q.maxCoeff() - q.minCoeff() < std::numbers::pi) return;  // its velocity, or t, is in another unit
   Eigen::Index forth = 0, back = 0;
   for (Eigen::Index i = 0; i < n; ++i) {
     const double step = t[i + 1] - t[i], turned = step * dq[i];

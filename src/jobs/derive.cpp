@@ -1,6 +1,7 @@
 #include "gp2/jobs/derive.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -19,6 +20,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/simulate.hpp"
+#include "jobs/rate_check.hpp"
 #include "jobs/raw_log.hpp"
 #include "smoothing/constrained_states.hpp"
 #include "smoothing/smooth_each.hpp"
@@ -38,6 +40,55 @@ constexpr double most_rows = 1e7;
 template <typename T>
 void release(std::vector<T>& values) {
   values = std::vector<T>();
+}
+
+/// A position that jumps and stays there, as that of an encoder which was set anew, or was stuck until then.
+struct Jump {
+  double time = 0, by = 0;
+  int n_equal = 0;  // samples before it
+};
+
+/// @param all  in order of time
+std::optional<Jump> jump_of(const std::vector<Measurement>& all) {
+  constexpr std::size_t fewest = 50, window = 5;
+  constexpr double fast = 10, far = 20;  // times the usual step, times the smallest one
+  std::vector<double> times, values, steps, rates;
+  for (const Measurement& one : all) {
+    if (one.velocity || (!times.empty() && !(one.time > times.back()))) continue;
+    if (!times.empty()) {
+      steps.push_back(std::abs(one.value - values.back()));
+      rates.push_back(steps.back() / (one.time - times.back()));
+    }
+    times.push_back(one.time);
+    values.push_back(one.value);
+  }
+  if (times.size() < fewest) return std::nullopt;
+  const auto usual = [](std::vector<double> of) {  // of all but one in a hundred the largest
+    const auto at = of.begin() + static_cast<std::ptrdiff_t>(of.size() * 99 / 100);
+    std::nth_element(of.begin(), at, of.end());
+    return *at;
+  };
+  const auto middle = [&](std::size_t first) {
+    std::array<double, window> some = {};
+    std::copy_n(values.begin() + static_cast<std::ptrdiff_t>(first), window, some.begin());
+    std::nth_element(some.begin(), some.begin() + window / 2, some.end());
+    return some[window / 2];
+  };
+  double smallest = std::numeric_limits<double>::infinity();
+  for (const double step : steps) smallest = step > 0 ? std::min(smallest, step) : smallest;
+  const double usual_step = usual(steps), usual_rate = usual(rates);
+  for (std::size_t i = window; i + window <= times.size(); ++i) {  // from i − 1 to i
+    const double step = steps[i - 1];
+    if (!(step > fast * usual_step && rates[i - 1] > fast * usual_rate && step > far * smallest)) continue;
+    // all others about it go on as usual, and it does not come back
+    bool is_alone = true;
+    for (std::size_t k = i - window; k + 1 < i + window; ++k) is_alone = is_alone && (k == i - 1 || fast * steps[k] < step);
+    if (!is_alone || std::abs(middle(i) - middle(i - window)) < step / 2) continue;
+    Jump found{times[i], values[i] - values[i - 1], 1};
+    for (std::size_t k = i - 1; k > 0 && steps[k - 1] == 0; --k) ++found.n_equal;
+    return found;
+  }
+  return std::nullopt;
 }
 
 /// How samples of one time differ, beside how fast the motion passes there: d = δ q̇ + noise. Two measurements of one time have δ = 0;
@@ -145,6 +196,23 @@ class Deriver {
       }
     }
     data_.notes = std::move(raw_.notes);
+    warn_of_jumps();
+  }
+
+  void warn_of_jumps() {
+    for (const Task& task : tasks_) {
+      const std::optional<Jump> jump = jump_of(task.channel.measurements);
+      if (!jump) continue;
+      constexpr int many = 20;
+      data_.notes.push_back(
+          fmt::format("warning: {}: {} jumps by {:.3g} at t = {:.6g} and stays there{}", log_.name(), name_of(task.coordinate),
+                      jump->by, episode_of(task.episode).start + jump->time,
+                      jump->n_equal < many
+                          ? ": was its encoder set anew? Split the log there by a column `episode`"
+                          : fmt::format(", after {} equal samples: was its sensor stuck? Leave these rows out and split the log "
+                                        "there by a column `episode`",
+                                        jump->n_equal)));
+    }
   }
 
   [[nodiscard]] const Episode& episode_of(int e) const { return episodes_[static_cast<std::size_t>(e)]; }
@@ -500,6 +568,7 @@ class Deriver {
     for (std::size_t u = 0; u < system_.inputs().size(); ++u) {
       if (!raw_.has_input(u)) continue;
       const std::vector<bool> driven = driven_by(u);
+      std::vector<double> as_logged;
       for (int e = 0; e < std::ssize(episodes_); ++e) {
         const Episode& episode = episode_of(e);
         const auto slowest_of = [&](bool those_driven) {
@@ -513,6 +582,7 @@ class Deriver {
         const DerivedSeries* slowest = slowest_of(/*those_driven=*/true);
         if (!slowest) slowest = slowest_of(/*those_driven=*/false);
         const Channel channel = raw_.input(u, episode);
+        for (const Measurement& one : channel.measurements) as_logged.push_back(one.value + channel.mean);
         const VectorXd times = times_to_write(episode);
         const Index first = first_row_[static_cast<std::size_t>(e)];
         smooth_each(slowest->model, channel.measurements, times,
@@ -520,6 +590,8 @@ class Deriver {
                       data_.states(system_.layout().u(static_cast<int>(u)), first + i) = motion[0] + channel.mean;
                     });
       }
+      const Eigen::Map<const Eigen::RowVectorXd> commands(as_logged.data(), std::ssize(as_logged));
+      if (auto text = clipped_input(system_.inputs()[u], commands)) data_.notes.push_back(*std::move(text));
     }
   }
 

@@ -53,12 +53,8 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
     if (!view.is_of_ddq() || view.other_system) continue;
     const std::string of_log = observations.size() > 1 ? fmt::format(" of log {}", g + 1) : "";
     for (int k = 0; k < system.layout().nu; ++k) {
-      if (const std::optional<PileUp> found = pile_up(group.states().row(system.layout().u(k)))) {
-        notes.push_back(
-            fmt::format("the input {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: "
-                        "clipped? The log must contain the acting input",
-                        system.inputs()[static_cast<std::size_t>(k)], of_log, found->value, 100 * found->share));
-      }
+      const std::string& input = system.inputs()[static_cast<std::size_t>(k)];
+      if (auto text = clipped_input(input + of_log, group.states().row(system.layout().u(k)))) notes.push_back(*std::move(text));
     }
     const std::vector<std::string> names = view.names(system);
     for (int k = 0; k < view.size(); ++k) {

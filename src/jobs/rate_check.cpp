@@ -334,6 +334,15 @@ std::optional<PileUp> pile_up(const Ref<const RowVectorXd>& values) {
   return PileUp{value, static_cast<double>(at_end) / static_cast<double>(n)};
 }
 
+std::optional<std::string> clipped_input(const std::string& input, const Ref<const RowVectorXd>& values) {
+  const std::optional<PileUp> found = pile_up(values);
+  if (!found) return std::nullopt;
+  return fmt::format(
+      "the input {} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: clipped? The "
+      "log must contain the acting input",
+      input, found->value, 100 * found->share);
+}
+
 std::vector<Index> far_values(const Ref<const RowVectorXd>& values) {
   constexpr double far = 30;
   constexpr Index fewest = 20, one_in = 200;

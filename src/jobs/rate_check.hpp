@@ -44,6 +44,8 @@ struct PileUp {
 /// The extreme at which values of a continuous column pile up, neither 0 nor of one that takes a few values only, as one does that is
 /// switched, held or coarsely rounded.
 std::optional<PileUp> pile_up(const Eigen::Ref<const Eigen::RowVectorXd>& values);
+/// What that of an input means.
+std::optional<std::string> clipped_input(const std::string& input, const Eigen::Ref<const Eigen::RowVectorXd>& values);
 
 /// The few values, at most one in 200 and at least one, that lie thirty times as far from the median as any other; none where all
 /// others are the same, as those of an input between pulses are.

@@ -525,10 +525,12 @@ int n_repeated_rows(const std::vector<MeasuredRows>& logs) {
     const MeasuredRows* log;
     Index i;
     std::uint64_t hash = 0;
-    // NaN is not equal to itself, and −0 is 0
+    // NaN is not equal to itself, and −0 is 0; the last digits may not be those of another program that read and wrote a log
     [[nodiscard]] double entry(Index k) const {
       const double one = k < log->states.rows() ? log->states(k, i) : log->values(k - log->states.rows(), i);
-      return std::isnan(one) || one == 0 ? 0.0 : one;
+      if (std::isnan(one) || one == 0) return 0;
+      constexpr std::uint64_t last = (std::uint64_t{1} << 12) - 1;  // bits, which leaves twelve digits
+      return std::bit_cast<double>((std::bit_cast<std::uint64_t>(one) + (last + 1) / 2) & ~last);
     }
     [[nodiscard]] Index size() const { return log->states.rows() + log->values.rows(); }
   };

@@ -356,8 +356,17 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   const double before = left_out(posterior);
   const auto n_before = static_cast<double>(posterior.n_states());
   const int n_more = more.n_data(), n_draws = posterior.n_components();
+  const FitPriorOptions before_range = fit.prior_options;
   if (n_more > 0) extend_range(posterior, fit, more);
-  Posterior all = update_where_possible(std::move(posterior), fit.report, more);
+  Posterior all = [&] {
+    try {
+      return update_where_possible(std::move(posterior), fit.report, more);
+    } catch (...) {
+      fit.prior_options = before_range;
+      set_prior(posterior, fit.prior());
+      throw;
+    }
+  }();
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
   if (n_more > 0) fit.notes.reset();
   if (n_more > 0 && log.file()) fit.logs.push_back(*log.file());

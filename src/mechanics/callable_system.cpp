@@ -102,14 +102,19 @@ void CallableSystem::require_symmetry(const char* function, const SystemValues& 
   }
 }
 
-SystemValues CallableSystem::evaluate(const States& states, const Parameters& parameters) const {
+void CallableSystem::evaluate_into(const States& states, const Parameters& parameters, SystemValues& values) const {
   require_states(states);
   require_parameters(parameters);
-  SystemValues values = definition_.evaluate(states, parameters);
+  values = definition_.evaluate(states, parameters);
   require_shapes("evaluate", values, states.cols());
+  for (int i = 0; i < values.n_states(); ++i) require_symmetry("evaluate", values, i, false);
+}
+
+SystemValues CallableSystem::evaluate(const States& states, const Parameters& parameters) const {
+  SystemValues values;
+  evaluate_into(states, parameters, values);
   // at other parameters a fit may be on the way through: the likelihood is +∞ there
   if (parameters == parameter_values()) require_finite("evaluate", values, states);
-  for (int i = 0; i < values.n_states(); ++i) require_symmetry("evaluate", values, i, false);
   return values;
 }
 

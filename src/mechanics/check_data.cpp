@@ -10,6 +10,7 @@
 
 #include "base/decompositions.hpp"
 #include "base/not_a_number.hpp"
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
@@ -301,6 +302,17 @@ std::vector<ConstraintViolation> constraint_violations(const System& system, con
     if (spreads[row] < 0) spreads[row] = spread(states.row(row));
     return spreads[row];
   };
+  // a guide holds a coordinate where it is, whose spread is the violation itself: others of its kind tell how far the system moves
+  const auto moved = [&](bool velocity, int j) {
+    constexpr double share = 0.01;
+    double largest = 0;
+    for (int i = 0; i < system.nq(); ++i) {
+      if (system.coordinates()[static_cast<std::size_t>(i)].angle != system.coordinates()[static_cast<std::size_t>(j)].angle)
+        continue;
+      largest = std::max(largest, spread_of(velocity ? layout.dq(i) : layout.q(i)));
+    }
+    return std::max(spread_of(velocity ? layout.dq(j) : layout.q(j)), share * largest);
+  };
   std::vector<ConstraintViolation> violations;
   for (std::size_t k = 0; k < labels.size(); ++k) {
     const OfResidual& one = all[k];
@@ -309,7 +321,7 @@ std::vector<ConstraintViolation> constraint_violations(const System& system, con
     if (!one.is_measured) continue;
     double scale = 0;
     for (int j = 0; j < system.nq(); ++j) {
-      scale += one.weights[j] * spread_of(labels[k].velocity ? layout.dq(j) : layout.q(j));
+      if (one.weights[j] > 0) scale += one.weights[j] * moved(labels[k].velocity, j);
     }
     if (scale == 0) scale = 1;
     const double n = static_cast<double>(std::max<Index>(1, one.n_active));
@@ -454,6 +466,8 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
 std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                 const Ref<const MatrixXd>& accelerations, const Ref<const MatrixXd>& stddev,
                                 const std::vector<int>& stated, bool estimates_noise) {
+  system.require_states(states);
+  require_shape("check_data: accelerations", accelerations, system.nq(), states.cols());
   const bool estimates =
       std::any_of(system.parameters().begin(), system.parameters().end(), [](const auto& one) { return one.estimate; });
   std::vector<Finding> findings;

@@ -142,7 +142,10 @@ std::string Model::labelled(const std::string& quantity) const {
   return unit.empty() ? quantity : fmt::format("{} [{}]", quantity, unit);
 }
 
-SystemSymbols Model::symbols() const { return {*graph, system->coordinates(), system->inputs(), system->parameters()}; }
+SystemSymbols Model::symbols() const {
+  require_system(system);
+  return {*graph, system->coordinates(), system->inputs(), system->parameters()};
+}
 
 const SymbolicSystem* Model::symbolic_system() const {
   // code may give a system of expressions too, but of another graph
@@ -151,6 +154,7 @@ const SymbolicSystem* Model::symbolic_system() const {
 }
 
 const SymbolicSystem& require_symbolic_system(const Model& model) {
+  require_system(model.system);
   if (const SymbolicSystem* system = model.symbolic_system()) return *system;
   throw InputError(
       fmt::format("{}: the mechanics of '{}' are code: there are no expressions of M, A, b and F; only a model file with "

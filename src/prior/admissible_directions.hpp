@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <Eigen/Core>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 
@@ -22,11 +23,15 @@ class AdmissibleDirections {
 
   /// @param A  (nc × nq)
   /// @param B  diagonal (nq × nq), positive
-  /// @returns E (nq × nq)
+  /// @returns E (nq × nq), NaN where B is not finite
   /// @throws NumericalError where W⁻¹ overflows or underflows.
   const Eigen::MatrixXd& compute(const Matrix& A, const Matrix& B) {
     if (b_.size() != A.rows()) b_.setZero(A.rows());
     stddev_ = B.diagonal();
+    if (!stddev_.allFinite()) {  // as B is where an entry of the state is not known: who asked tells of it
+      E_.setConstant(B.rows(), B.cols(), not_a_number);
+      return E_;
+    }
     mass_ = stddev_.cwiseAbs2().cwiseInverse().asDiagonal();
     projection_.compute(mass_, A, b_);
     if (!projection_.motion_is_determined()) {

@@ -58,15 +58,18 @@ class CodeFunction::DifferenceEvaluator final : public Evaluator {
   DifferenceEvaluator(const CodeFunction& function, VectorXd parameters, std::vector<StateDerivatives::Entry> entries)
       : function_(function), parameters_(std::move(parameters)), differences_(std::move(entries)) {}
 
-  void evaluate(const Ref<const VectorXd>& state, Ref<VectorXd> values) override {
-    values = function_.evaluate(state, parameters_);
-  }
+  void evaluate(const Ref<const VectorXd>& state, Ref<VectorXd> values) override { values = values_at(state); }
   [[nodiscard]] const std::vector<StateDerivatives::Entry>& entries() const override { return differences_.entries(); }
   void differentiate(const Ref<const VectorXd>& state, Ref<VectorXd> derivatives) override {
-    differences_.differentiate(function_.evaluate(differences_.states_around(state), parameters_), derivatives);
+    differences_.differentiate(values_at(differences_.states_around(state)), derivatives);
   }
 
  private:
+  // A state may have no prediction, of which a control loop is told by a Status.
+  [[nodiscard]] MatrixXd values_at(const MatrixXd& states) const {
+    return function_.checked(function_.code_.evaluate(states, parameters_), "evaluate", states, /*must_be_finite=*/false);
+  }
+
   const CodeFunction& function_;
   VectorXd parameters_;
   StateDifferences differences_;

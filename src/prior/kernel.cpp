@@ -10,6 +10,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/shape.hpp"
 #include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "prior/kernel_columns.hpp"
@@ -218,6 +219,7 @@ Kernel Kernel::parse(std::string_view text, std::span<const std::string> feature
 
 MatrixXd Kernel::evaluate(const Ref<const MatrixXd>& left, const Ref<const MatrixXd>& right,
                           const Ref<const VectorXd>& values) const {
+  require_shape("Kernel::evaluate: the points on the right", right, right.rows(), left.cols());
   const KernelColumns columns(*this, left, values);
   KernelColumns::Workspace workspace;
   VectorXd point, column(columns.n_rows());

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 #include "gp2/simulate.hpp"
 
@@ -72,7 +73,8 @@ InputSignal::Place InputSignal::place(Index input, double t) const {
 }
 
 void InputSignal::evaluate(double t, Eigen::Ref<VectorXd> u) const {
-  if (is_zero()) u.setZero();
+  if (is_zero()) return u.setZero(), void();
+  require_shape("inputs: u", u, values_.rows(), 1);
   for (Index j = 0; j < values_.rows(); ++j) {
     const Place arriving = place(j, t - delay_[j]);
     u[j] = arriving.since < 0
@@ -82,7 +84,8 @@ void InputSignal::evaluate(double t, Eigen::Ref<VectorXd> u) const {
 }
 
 void InputSignal::command(double t, Eigen::Ref<VectorXd> u) const {
-  if (is_zero()) u.setZero();
+  if (is_zero()) return u.setZero(), void();
+  require_shape("inputs: u", u, values_.rows(), 1);
   for (Index j = 0; j < values_.rows(); ++j) u[j] = place(j, t).command;
 }
 

@@ -2,6 +2,7 @@
 
 #include <fmt/format.h>
 
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/quantity.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
@@ -158,6 +159,10 @@ MatrixXd ModelMotion::multipliers(const Eigen::Ref<const MatrixXd>& states) cons
 
 MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states, const MatrixXd& slip) {
   require_truth(model);
+  if (slip.size() > 0) {
+    const Eigen::Index n_soft = (model.system->constraint_noise().array() > 0).count();
+    require_shape("true_acceleration: slip", slip, n_soft, states.cols());
+  }
   MatrixXd accelerations = ModelMotion(model).acceleration(states, slip);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     if (!accelerations.col(i).allFinite()) {

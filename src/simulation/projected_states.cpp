@@ -8,6 +8,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/shape.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "simulation/projection.hpp"
@@ -57,6 +58,8 @@ double median_where_active(const System& system, int row, const Ref<const Eigen:
 ProjectedStates project_states(const System& system, const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& states,
                                const MatrixXd& stddevs) {
   const Index n_moving = 2 * static_cast<Index>(system.nq());
+  system.require_states(states);
+  require_shape("project_states: stddevs", stddevs, n_moving, states.cols());
   ProjectedStates out{states, MatrixXd::Zero(n_moving, states.cols()), {}};
   const MatrixXd residuals = system.residuals(states, parameters);
   const auto label = [&](Index k) { return system.residual_labels()[static_cast<std::size_t>(k)].text; };

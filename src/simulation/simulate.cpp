@@ -12,6 +12,7 @@
 #include <boost/numeric/odeint/stepper/controlled_runge_kutta.hpp>
 #include <boost/numeric/odeint/stepper/runge_kutta_dopri5.hpp>
 
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulation/model_motion.hpp"
@@ -666,6 +667,7 @@ class Integration {
     if (!options_.record) return;
     const VectorXd recorded = switching_.mixed(state_, options_.record);
     if (out_.records.size() == 0) out_.records.resize(recorded.size(), options_.times.size());
+    require_shape("simulate: what is recorded", recorded, out_.records.rows(), 1);
     out_.records.col(row) = recorded;
   }
 
@@ -745,6 +747,8 @@ Trajectory simulate(const System& system, const VectorXd& parameters, const Acce
   VectorXd state = start;
   state[layout.t()] = options.times[0];
   options.inputs.evaluate(options.times[0], state.tail(layout.nu));
+  // whether there is contact follows from the motion
+  for (const Contact& contact : options.contacts) state[layout.u(contact.input)] = 0;
   const double position_residual = projection.largest_residual(state, false);
   const double velocity_residual = projection.largest_residual(state, true);
   if (options.project) projection.apply(state);

@@ -84,13 +84,13 @@ LeastSquares solve(const Prior& prior, const std::vector<const Observations*>& g
       weight[k] = terms > 0 ? 1 / std::max(scatter, 1e-9 * terms) : 0;
     }
     const VectorXd weights = weight.replicate(c.cols(), 1);
-    const Eigen::JacobiSVD<MatrixXd> svd(weights.asDiagonal() * J, Eigen::ComputeThinU | Eigen::ComputeThinV);
+    const Eigen::JacobiSVD<MatrixXd> svd(weights.asDiagonal() * J, Eigen::ComputeThinU | Eigen::ComputeFullV);
     const VectorXd& singular = svd.singularValues();
     const double smallest = 1e-8 * singular[0];
     VectorXd step = VectorXd::Zero(n), variance = VectorXd::Zero(n);
-    for (Index r = 0; r < singular.size(); ++r) {
+    for (Index r = 0; r < n; ++r) {
       const VectorXd v = svd.matrixV().col(r);
-      if (singular[r] > smallest) {
+      if (r < singular.size() && singular[r] > smallest) {
         step -= v * (svd.matrixU().col(r).dot(weights.cwiseProduct(c.reshaped())) / singular[r]);
         variance += v.cwiseAbs2() / (singular[r] * singular[r]);
       } else {

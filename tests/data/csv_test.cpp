@@ -122,6 +122,13 @@ TEST(Csv, AFileWithoutDataIsRefused) {
   EXPECT_EQ(input_error_of([] { parse("q1,q2\n"); }), "log.csv: no data rows after the header");
 }
 
+TEST(Csv, TrueAndFalseAreNumbers) {
+  const CsvTable table = parse("touch,x\nTrue,1\n False ,a\n");
+  EXPECT_EQ(table.number(0, 0), 1);
+  EXPECT_EQ(table.number(1, 0), 0);
+  EXPECT_FALSE(table.is_text(0));
+}
+
 TEST(Csv, TheFirstRowsAreATableOfTheirOwn) {
   const CsvTable table = parse("q1,q2\n1,2\n\n3,x\n5,6\n");
   const CsvTable first = table.first_rows(2);

@@ -1,6 +1,8 @@
 #include "gp2/observations.hpp"
 
+#include <functional>
 #include <limits>
+#include <vector>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -71,6 +73,16 @@ TEST(Observations, RefusesSizesThatDoNotFit) {
     EXPECT_EQ(refused(values(), Eigen::Vector2d(1, sigma)),
               fmt::format("observations: `noise_stddev` must be positive and at most 1e+100, got {}", sigma));
   }
+}
+
+TEST(Observations, RefuseStatesThatTheyDoNotHave) {
+  const Observations all(states(), view, values(), Eigen::Vector2d(0.1, 0.2));
+  Observations fewer = all;
+  const std::vector<std::function<void()>> wrong = {[&] { static_cast<void>(all.take({4})); },
+                                                    [&] { static_cast<void>(all.take({-1})); },
+                                                    [&] { static_cast<void>(all.slice(3, 2)); }, [&] { fewer.remove_first(5); }};
+  for (const auto& one : wrong) EXPECT_THAT(input_error_of(one), testing::EndsWith("are asked for, of 4"));
+  EXPECT_EQ(fewer.n_data(), 4);
 }
 
 TEST(Statistics, TheMedianOfAnEvenNumberIsTheLargerOfTheTwoInTheMiddle) {

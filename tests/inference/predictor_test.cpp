@@ -463,7 +463,7 @@ TEST(PredictorTest, InSinglePrecisionIsThePosteriorUnderEveryKernel) {
   }
 }
 
-Posterior prior_of_one_point(const std::string& mass, const std::string& constraints) {
+Posterior prior_of_one_point(const std::string& mass, const std::string& constraints, bool with_discrepancy = false) {
   const Model model = Model::parse(fmt::format(R"toml(
 name        = "a point"
 coordinates = ["x", "y"]
@@ -479,7 +479,11 @@ directions = "acceleration"
 )toml",
                                                mass, constraints),
                                    "a point");
-  return {make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()}};
+  if (!with_discrepancy) return {make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()}};
+  const VectorXd one = VectorXd::Ones(1);
+  PriorOptions options;
+  options.discrepancy = Discrepancy{one, VectorXd::Ones(2), Latent::Base::admissible, one, one};
+  return {make_prior(model, options), {}, {{one, VectorXd::Ones(2)}, {VectorXd::Ones(2), one}, {}, {}, VectorXd()}};
 }
 
 TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
@@ -513,6 +517,7 @@ TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
   expect(prior_of_one_point("x", "\"ddx - y\""), zero, Status::no_unconstrained_acceleration);
   expect(prior_of_one_point("1", "\"ddx - x\", \"ddx - 1\""), zero, Status::contradicting_constraints);
   expect(prior_of_one_point("x", "\"ddx - y\""), unknown, Status::not_finite);
+  expect(prior_of_one_point("1", "\"ddy - x\"", /*with_discrepancy=*/true), unknown, Status::not_finite);
   expect(prior_of_one_point("1", "\"ddx - 1/x\""), zero, Status::not_finite);
   expect(prior_of_one_point("1", "\"ddy - y\""), unknown, Status::not_finite);
 

@@ -104,6 +104,31 @@ TEST(Derive, TableHasADeviationForWhatWasMeasured) {
   EXPECT_EQ(table.number(7, table.find("dq3_std")), data.stddev(6 + 2, 7));
 }
 
+TEST(Derive, APositionThatJumpsAndStaysIsSaid) {
+  const auto notes_of = [](const std::function<void(std::vector<Row>&)>& edit) { return derive(cart(), cart_log(edit)).notes; };
+  const auto shifted = [](std::vector<Row>& rows, std::size_t from, double by) {
+    for (std::size_t k = from; k < rows.size(); ++k) rows[k][1] = shortest(std::stod(rows[k][1]) + by);
+  };
+  EXPECT_THAT(notes_of([&](auto& rows) { shifted(rows, 120, 0.7); }),
+              Contains(HasSubstr("log.csv: q1 jumps by 0.7 at t = 1.2 and stays there: was its encoder set anew?")));
+  EXPECT_THAT(notes_of([&](auto& rows) {
+                shifted(rows, 120, 0.7);
+                for (std::size_t k = 60; k < 120; ++k) rows[k][1] = rows[60][1];
+              }),
+              Contains(HasSubstr("after 60 equal samples: was its sensor stuck?")));
+  // sound: single errors, coarse steps, a gap, a burst of samples close in time
+  const std::vector<std::function<void(std::vector<Row>&)>> sound = {
+      [](auto&) {}, [](auto& rows) { rows[100][1] = "3"; },
+      [](auto& rows) {
+        for (Row& row : rows) row[1] = shortest(std::round(std::stod(row[1]) / 0.05) * 0.05);
+      },
+      [](auto& rows) { rows.erase(rows.begin() + 50, rows.begin() + 90); },
+      [](auto& rows) {
+        for (std::size_t k = 1; k < rows.size(); k += 20) rows[k][0] = shortest(std::stod(rows[k - 1][0]) + 1e-6);
+      }};
+  for (const auto& edit : sound) EXPECT_THAT(notes_of(edit), testing::Not(Contains(HasSubstr("jumps by"))));
+}
+
 TEST(Derive, SameBitsForAnyNumberOfThreads) {
   const SimulatedLog log = short_log();
   const DerivedData one = derive(pendulum(), log.table, {.n_threads = 1}),

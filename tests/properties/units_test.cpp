@@ -196,6 +196,7 @@ TEST(UnitsTest, MillimetresTonnesAndMillisecondsLearnTheSame) {
 TEST(UnitsTest, EachCoordinateMayHaveAUnitOfItsOwn) {
   for (const Case& c : cases) {
     expect_same({"mm, inches and kilometres", Eigen::Vector3d(1e3, 1 / 0.0254, 1e-3), 1, 1, 7}, c);
+    expect_same({"micrometres, metres and megametres", Eigen::Vector3d(1e6, 1, 1e-6), 1, 1, 1}, c);
   }
 }
 

@@ -127,14 +127,16 @@ def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):
 
 def test_a_table_has_its_own_name_or_the_one_that_is_given(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_text("x,said\n\n1,yes\n", encoding="utf-8")
-    columns = {"x": [1.0], "said": ["yes"]}
+    path.write_text("x,said,mixed\n\n1,yes,1\n2,no,x\n", encoding="utf-8")
+    columns = {"x": [1.0, 2.0], "said": ["yes", "no"], "mixed": ["1", "x"]}
     assert gp2.Table(columns).name == "data" and gp2.Table(columns, name="monday").name == "monday"
     assert gp2.Table(path).name == str(path)
-    for table, place in [(gp2.Table(path, name="monday"), 3), (gp2.Table(gp2.Table(columns), name="monday"), 2)]:
-        assert table.name == "monday" and table["x"] == [1.0]
-        with pytest.raises(gp2.InputError, match=f"^monday:{place}: column 'said': 'yes' is not a finite number"):
-            table["said"]
+    for table, place in [(gp2.Table(path, name="monday"), 4), (gp2.Table(gp2.Table(columns), name="monday"), 3)]:
+        assert table.name == "monday" and list(table["x"]) == [1, 2]
+        assert list(table["said"]) == ["yes", "no"]
+        with pytest.raises(gp2.InputError, match=f"^monday:{place}: column 'mixed': 'x' is not a finite number"):
+            table["mixed"]
+    assert list(gp2.Table({"touch": np.array([True, False])})["touch"]) == [1, 0]
     assert gp2.Table(gp2.Table(columns, name="monday")).name == "monday"
 
 

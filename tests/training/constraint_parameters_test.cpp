@@ -41,8 +41,7 @@ directions = "acceleration"
                       "bead");
 }
 
-Observations observe(const Model& model, double position_noise, std::uint64_t seed, double h = 0) {
-  constexpr int n = 40;
+Observations observe(const Model& model, double position_noise, std::uint64_t seed, double h = 0, int n = 40) {
   RandomStream random(seed);
   MatrixXd states = MatrixXd::Zero(model.system->layout().size(), n), values(2, n);
   for (int i = 0; i < n; ++i) {
@@ -139,6 +138,12 @@ TEST(ConstraintParameters, KeepTheirStartWhereNothingKnowsThem) {
   EXPECT_NEAR(found[0].value, 1, 0.01);
   EXPECT_NEAR(found[1].value, 0.7, 1e-3);
   EXPECT_TRUE(std::isinf(found[1].stddev)) << "nothing is known of it";
+}
+
+TEST(ConstraintParameters, AreNotKnownFromFewerStatesThanThereAreParameters) {
+  const Model model = bead("x^2 + y^2 - l^2");
+  const std::vector<Found> found = fit_of(model, observe(model, 1e-3, 5, 0, /*n=*/1), {"l", "p"});
+  EXPECT_TRUE(std::isinf(found[1].stddev)) << found[1].stddev;
 }
 
 TEST(ConstraintParameters, HaveTheDeviationOfTheirPriorWhereNothingElseKnowsThem) {

@@ -63,6 +63,8 @@ class CallableSystem final : public System {
 
   /// @throws InputError naming the function, what was expected and what it returned.
   [[nodiscard]] SystemValues evaluate(const States& states, const Parameters& parameters) const override;
+  /// The same, but for numbers that are not finite: a state may have no prediction, of which a control loop is told by a Status.
+  void evaluate_into(const States& states, const Parameters& parameters, SystemValues& values) const override;
   [[nodiscard]] SystemValues differentiate(const States& states, const Parameters& parameters, int index) const override;
   [[nodiscard]] Eigen::MatrixXd residuals(const States& states, const Parameters& parameters) const override;
 
