@@ -68,8 +68,8 @@ class ExactFit {
       of.motion = std::make_unique<NonlinearMotion>(there, group.states(), of.parameters, *of.mechanics,
                                                     require_prior_values(there, group.states(), of.parameters, *of.mechanics));
       of.view = evaluate_view(group.view(), *of.mechanics, group.states());
+      linear_.emplace_back().balance = balance_of(*of.mechanics);
     }
-    linear_.resize(groups_.size());
   }
 
   /// Of the values that are given.

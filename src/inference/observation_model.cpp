@@ -1,6 +1,7 @@
 #include "inference/observation_model.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <optional>
 #include <utility>
 
@@ -52,6 +53,15 @@ Linearisation::OfGroup slice(const Linearisation::OfGroup& of, Index first, Inde
   return columns(of, Eigen::seqN(first, n));
 }
 
+MatrixXd balance_of(const MechanicsBatch& mechanics) {
+  const auto of_mass = [](double m) { return std::ldexp(1, -10 * static_cast<int>(std::lround(std::ilogb(m) / 20.0))); };
+  MatrixXd balance(mechanics.values.force.rows(), mechanics.values.n_states());
+  for (Index i = 0; i < balance.cols(); ++i) {
+    balance.col(i) = mechanics.projections[static_cast<std::size_t>(i)].mass().diagonal().unaryExpr(of_mass);
+  }
+  return balance;
+}
+
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,
                         const std::vector<int>& gradient_parameters, const Linearisation* about,
                         std::vector<ObservationModel>& models) {
@@ -92,6 +102,7 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
         of_parameter.prior = differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index);
       }
     }
+    model.balance = balance_of(model.mechanics);
     keep_viewed(group.view(), model.values.prior);
     for (ObservationModel::Values& d : model.derivatives) keep_viewed(group.view(), d.prior);
   }

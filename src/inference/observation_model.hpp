@@ -20,7 +20,12 @@ struct ObservationModel {
   Values values;
   std::vector<Values> derivatives;  // one per gradient parameter
   MechanicsBatch mechanics;         // that they come from
+  Eigen::MatrixXd balance;          // balance_of these
 };
+
+/// What brings the columns of G at each state to one size, so that their rank does not depend on the units of coordinates: 1/√M_jj, to
+/// the nearest power of 1024, which changes no bit where units are usual ones (nq × N).
+Eigen::MatrixXd balance_of(const MechanicsBatch& mechanics);
 
 /// Of some states of each Observations, [group][state].
 Linearisation take(const Linearisation& of, const std::vector<std::vector<int>>& states);

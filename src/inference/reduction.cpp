@@ -81,7 +81,7 @@ class Split {
       sample.C.resize(0, 0);
       W_.noalias() = diagonal.asDiagonal() * G;
     }
-    factors_ = W_ * balance(model.mechanics.projections[static_cast<std::size_t>(i)].mass()).asDiagonal();
+    factors_ = W_ * model.balance.col(i).asDiagonal();
     reflection_.resize(std::min(W_.rows(), W_.cols()));
     order_.resize(W_.cols());
     const Index rank = internal::pivoted_qr(factors_, reflection_, order_, UdwadiaKalaba::rank_tolerance);
@@ -104,13 +104,6 @@ class Split {
   }
 
  private:
-  // The rank must not depend on the units of the coordinates, of which that of √M_jj is free. Powers of 1024 keep all bits where units
-  // are usual ones.
-  static VectorXd balance(const MatrixXd& mass) {
-    return mass.diagonal().unaryExpr(
-        [](double m) { return std::ldexp(1, -10 * static_cast<int>(std::lround(std::ilogb(m) / 20.0))); });
-  }
-
   MatrixXd W_, factors_;
   VectorXd reflection_;
   Eigen::VectorXi order_;

@@ -59,7 +59,7 @@ ProjectedStates project_states(const System& system, const Ref<const VectorXd>& 
                                const MatrixXd& stddevs) {
   const Index n_moving = 2 * static_cast<Index>(system.nq());
   system.require_states(states);
-  require_shape("project_states: stddevs", stddevs, n_moving, states.cols());
+  if (stddevs.size() > 0) require_shape("project_states: stddevs", stddevs, n_moving, states.cols());
   ProjectedStates out{states, MatrixXd::Zero(n_moving, states.cols()), {}};
   const MatrixXd residuals = system.residuals(states, parameters);
   const auto label = [&](Index k) { return system.residual_labels()[static_cast<std::size_t>(k)].text; };

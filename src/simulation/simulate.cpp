@@ -747,8 +747,6 @@ Trajectory simulate(const System& system, const VectorXd& parameters, const Acce
   VectorXd state = start;
   state[layout.t()] = options.times[0];
   options.inputs.evaluate(options.times[0], state.tail(layout.nu));
-  // whether there is contact follows from the motion
-  for (const Contact& contact : options.contacts) state[layout.u(contact.input)] = 0;
   const double position_residual = projection.largest_residual(state, false);
   const double velocity_residual = projection.largest_residual(state, true);
   if (options.project) projection.apply(state);

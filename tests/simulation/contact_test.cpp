@@ -59,10 +59,8 @@ position = [{ expr = "sqrt(x^2 + z^2) - 1", contact = "touch" }]
                       "bead");
 }
 
-Trajectory motion_of(const Model& model, const std::vector<double>& start, double t_end, int n, double tolerance = 0,
-                     InputSignal inputs = {}) {
+Trajectory motion_of(const Model& model, const std::vector<double>& start, double t_end, int n, double tolerance = 0) {
   SimulateOptions options;
-  options.inputs = std::move(inputs);
   options.times = VectorXd::LinSpaced(n, 0, t_end);
   if (tolerance > 0) options.relative_tolerance = options.absolute_tolerance = tolerance;
   options.contacts = contacts_of(model, model.system->parameter_values());
@@ -125,12 +123,6 @@ TEST(Contact, OfABouncingBallHitsWhenTheClosedFormSays) {
     EXPECT_NEAR(motion.records(0, i), 2 * g, 1e-12);
   }
   expect_constraints(model, motion);
-}
-
-TEST(Contact, FollowsFromTheMotionWhateverALogSaysOfIt) {
-  const Model model = ball("0.5");
-  const InputSignal touches(Eigen::Vector2d(0, 1), MatrixXd::Ones(1, 2));
-  EXPECT_EQ(motion_of(model, {0, 1, 0, 0}, 1, 11, 0, touches).states, motion_of(model, {0, 1, 0, 0}, 1, 11).states);
 }
 
 TEST(Contact, EnergyFallsByTheSquareOfTheRestitution) {
