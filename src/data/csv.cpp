@@ -74,9 +74,6 @@ Parsed parse_number(std::string_view cell) {
   // from_chars knows no plus sign
   if (digits.starts_with('+') && !digits.starts_with("+-")) digits.remove_prefix(1);
   Parsed parsed;
-  for (const auto& [word, value] : {std::pair("True", 1.0), std::pair("False", 0.0)}) {
-    if (digits == word) return {value, true, std::errc()};
-  }
   const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), parsed.value);
   parsed.is_whole = end == digits.data() + digits.size();
   parsed.error = error;

@@ -122,11 +122,11 @@ TEST(Csv, AFileWithoutDataIsRefused) {
   EXPECT_EQ(input_error_of([] { parse("q1,q2\n"); }), "log.csv: no data rows after the header");
 }
 
-TEST(Csv, TrueAndFalseAreNumbers) {
-  const CsvTable table = parse("touch,x\nTrue,1\n False ,a\n");
-  EXPECT_EQ(table.number(0, 0), 1);
-  EXPECT_EQ(table.number(1, 0), 0);
-  EXPECT_FALSE(table.is_text(0));
+TEST(Csv, AColumnWithoutAnyNumberIsText) {
+  const CsvTable table = parse("label,x,y\na,1,\n,b,\n");
+  EXPECT_TRUE(table.is_text(0));
+  EXPECT_FALSE(table.is_text(1));
+  EXPECT_FALSE(table.is_text(2));
 }
 
 TEST(Csv, TheFirstRowsAreATableOfTheirOwn) {

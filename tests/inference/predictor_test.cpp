@@ -483,7 +483,7 @@ directions = "acceleration"
   const VectorXd one = VectorXd::Ones(1);
   PriorOptions options;
   options.discrepancy = Discrepancy{one, VectorXd::Ones(2), Latent::Base::admissible, one, one};
-  return {make_prior(model, options), {}, {{one, one}, {VectorXd::Ones(2), one}, {}, {}, VectorXd()}};
+  return {make_prior(model, options), {}, {{one, VectorXd::Ones(2)}, {VectorXd::Ones(2), VectorXd::Ones(2)}, {}, {}, VectorXd()}};
 }
 
 TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {

@@ -110,7 +110,7 @@ TEST(Derive, APositionThatJumpsAndStaysIsSaid) {
     for (std::size_t k = from; k < rows.size(); ++k) rows[k][1] = shortest(std::stod(rows[k][1]) + by);
   };
   EXPECT_THAT(notes_of([&](auto& rows) { shifted(rows, 120, 0.7); }),
-              Contains(HasSubstr("log.csv: q1 jumps by 0.7 at t = 1.2 and stays there: was its encoder set anew?")));
+              Contains(HasSubstr("log.csv: q1 jumps by 0.673 at t = 1.2 and stays there: was its encoder set anew?")));
   EXPECT_THAT(notes_of([&](auto& rows) {
                 shifted(rows, 120, 0.7);
                 for (std::size_t k = 60; k < 120; ++k) rows[k][1] = rows[60][1];

@@ -36,8 +36,7 @@ def test_tables_survive_a_pickle_with_gaps_and_text():
     again = pickle.loads(pickle.dumps(table))
     np.testing.assert_array_equal(again["n"], table["n"])
     for one in (table, again):
-        with pytest.raises(gp2.InputError, match="odd:2: column 'said': 'a, b' is not a finite number"):
-            one["said"]
+        assert list(one["said"]) == ["a, b", '"quoted"', " "]
 
 
 def test_logs_and_side_information_survive_a_pickle(arm, arm_log):
