@@ -286,7 +286,8 @@ void extend_range(Posterior& posterior, FitFile& fit, const Observations& more) 
   const MatrixXd features = extended.lengthscale.asDiagonal() * scaled.topRows(extended.lengthscale.size());
   const VectorXd lowest = features.rowwise().minCoeff().cwiseMin(extended.centre - extended.half_range);
   const VectorXd highest = features.rowwise().maxCoeff().cwiseMax(extended.centre + extended.half_range);
-  const bool is_within = ((highest - lowest) / 2 - extended.half_range).maxCoeff() <= 0;
+  constexpr double but_for_rounding = 1 + 1e-9;
+  const bool is_within = ((highest - lowest) / 2 - but_for_rounding * extended.half_range).maxCoeff() <= 0;
   if (is_within) return;
   extended.centre = (highest + lowest) / 2;
   extended.half_range = (highest - lowest) / 2;
