@@ -13,7 +13,8 @@ namespace gp2 GP2_API {
 
 /// Predictions of one view at one state after another, for control loops: mean, standard deviation, and the mean's Jacobian in
 /// the state. They allocate nothing, take no locks and call no BLAS, as long as the system is a SymbolicSystem (which every
-/// [mechanics] of a model file is); any other may allocate where it evaluates M, A, b, F.
+/// [mechanics] of a model file is); any other may allocate where it evaluates M, A, b, F, and so do
+/// products of matrices of more than a hundred coordinates.
 ///
 /// With β of posterior.hpp and the factored matrix L Lᵀ = K̃ + I,
 ///

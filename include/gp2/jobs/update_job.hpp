@@ -30,7 +30,8 @@ std::vector<Option> options(UpdateRequest& request);
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
                                std::vector<std::string>& notes);
 
-/// update(), with a word where what went through inducing points has none near the new observations.
+/// update(), with a word where what went through inducing points has none near the new observations. The range of the discrepancy (T23),
+/// in the posterior and in the fit, becomes that of all rows.
 /// @param fit  whose report loses the draws of the hyperparameters under which there is no posterior of all; and learns the log's name
 Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
