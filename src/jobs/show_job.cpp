@@ -340,7 +340,7 @@ std::string text_of(const FitReport& report, const Model& model) {
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
     std::string error;
-    if (h.is_system_parameter()) {
+    if (h.is_system_parameter() || h.kind == Hyperparameter::Kind::noise_stddev) {
       const ParameterUncertainty known = parameter_uncertainty(report, k);
       error = error_text(known.stddev);
       if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.6g} … {:.6g})", known.mean, known.lower, known.upper);

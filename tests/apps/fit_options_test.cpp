@@ -1,6 +1,7 @@
 #include <cmath>
 #include <set>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -136,7 +137,8 @@ TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
 }
 
 TEST_F(FitCommand, TellsOfTheHyperparametersThatItDrew) {
-  const nlohmann::json report = fit("--restarts 1 --max-escapes 0 --max-points 12 --estimate none --hyperparameters integrate");
+  const nlohmann::json report =
+      fit("--restarts 1 --max-escapes 0 --max-points 12 --estimate none --noise-std estimate --hyperparameters integrate");
   const nlohmann::json& draws = report.at("draws");
   EXPECT_EQ(draws.at("n_draws"), 25);
   EXPECT_EQ(draws.at("n_chains"), 8);
@@ -148,6 +150,9 @@ TEST_F(FitCommand, TellsOfTheHyperparametersThatItDrew) {
     EXPECT_GT(one.at("effective_size"), 0);
   }
   EXPECT_TRUE(desk.json("fit.json").at("report").contains("draws"));
+  const nlohmann::json& noise = draws.at("hyperparameters").back();
+  EXPECT_EQ(noise.at("name"), "noise_stddev(ddq3)");
+  EXPECT_THAT(desk.done("gp2 show fit.json").out, HasSubstr(fmt::format("(mean {:.6g}, ", noise.at("mean").get<double>())));
   EXPECT_FALSE(short_fit("").contains("draws"));
 }
 

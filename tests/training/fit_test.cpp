@@ -14,6 +14,7 @@
 #include "gp2/training/robust.hpp"
 #include "test_models.hpp"
 #include "thread_ranks.hpp"
+#include "training/objective.hpp"
 
 namespace gp2 {
 namespace {
@@ -63,12 +64,8 @@ std::vector<double> values_of(const std::vector<Hyperparameter>& hyperparameters
 // the objective by its definition: likelihood plus hyper-priors
 double objective(const Problem& p, const std::vector<Hyperparameter>& hyperparameters) {
   const ModelValues values = model_values(p.prior, p.observations, hyperparameters);
-  double sum = Posterior(p.prior, p.observations, values).negative_log_likelihood();
-  for (const Hyperparameter& h : hyperparameters) {
-    if (h.hyperprior.form == HyperPrior::Form::none) continue;
-    sum += 0.5 * std::pow(std::log(h.value / h.hyperprior.median) / h.hyperprior.stddev, 2);
-  }
-  return sum;
+  return Posterior(p.prior, p.observations, values).negative_log_likelihood() +
+         negative_log_hyperpriors(hyperparameters, nullptr);
 }
 
 TEST(FitTest, GivesTheSameBitsForAnyNumberOfThreads) {

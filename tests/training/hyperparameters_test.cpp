@@ -112,11 +112,31 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   expect_same(noise.lower, 1e-6 * output);
   expect_same(noise.upper, 2 * output);
   expect_same(noise.hyperprior.median, 0.1 * output);
+  EXPECT_EQ(noise.hyperprior.correlation, Standard::noise_correlation);
+  EXPECT_EQ(noise.hyperprior.family, find(all, "noise_stddev(ddq1)").hyperprior.family);
   EXPECT_EQ(find(all, "R").lower, 0.01);
   EXPECT_EQ(find(all, "R").upper, 0.07);
   for (const Hyperparameter& h : default_hyperparameters(prior, observations, {}, {Protocol::Name::standard, false})) {
     EXPECT_EQ(h.hyperprior.form, HyperPrior::Form::none) << h.name;
   }
+}
+
+// a log that states the deviations of some of its values knows how they compare
+TEST(HyperparametersTest, NoiseIsAsWrongInOneAccelerationAsInAnotherUnlessItIsStated) {
+  const Prior prior = make_prior(test::model("models/unicycle.toml"));
+  std::vector<Observations> observations = observe_drawn(test::model("models/unicycle.toml"), 40, true);
+  observations.push_back(observations[0]);
+  MatrixXd scale = MatrixXd::Ones(3, 40);
+  scale.row(1).setConstant(0.2);
+  observations[1] = observations[1].with_noise(Noise(observations[0].noise().stddev(), true, scale));
+  const auto all = default_hyperparameters(prior, observations, {}, {});
+  const auto family = [&](const std::string& name) { return find(all, "noise_stddev(" + name).hyperprior.family; };
+  EXPECT_NE(family("ddq1)"), "");
+  EXPECT_EQ(family("ddq1)"), family("ddq2)"));
+  EXPECT_EQ(family("ddq1)"), family("ddq3)"));
+  EXPECT_EQ(family("ddq1)#2"), family("ddq3)#2"));
+  EXPECT_NE(family("ddq1)"), family("ddq1)#2"));
+  EXPECT_EQ(family("ddq2)#2"), "");
 }
 
 // the surface's model with priors of its own

@@ -30,6 +30,7 @@ struct Protocol {
     static constexpr double shape_log_stddev = 1.5;  // of α, periods and relative amplitudes
     static constexpr double noise_lower = 1e-6, noise_upper = 2;
     static constexpr double noise_log_stddev = 2;
+    static constexpr double noise_correlation = 0.95;        // of one log, between its accelerations
     static constexpr double discrepancy_lengthscale = 1.25;  // of the feature's spread
     static constexpr double discrepancy_lower = 1e-3, discrepancy_upper = 10;
     static constexpr double discrepancy_median = 0.45, discrepancy_log_stddev = 0.15;  // of the noise
