@@ -195,7 +195,7 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
   h.value = std::clamp(observations.noise().stddev()[k], h.lower, h.upper);
   if (has_hyperpriors(protocol)) {
     h.hyperprior = {HyperPrior::Form::log_normal, h.value, is_stated ? stated_log_stddev : Standard::noise_log_stddev};
-    if (!is_stated) {  // who does not know the noise is wrong about all of it alike
+    if (!is_stated) {  // a start that is wrong is mostly wrong for all accelerations alike
       h.hyperprior.family = fmt::format("noise#{}", group + 1);
       h.hyperprior.correlation = Standard::noise_correlation;
     }
