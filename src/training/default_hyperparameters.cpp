@@ -186,7 +186,7 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
   }
   // Who states deviations knows them to a factor of some size. Errors that go on from row to row, as smoothing leaves them, would
   // have the factor collapse: neighbours agree, and the latents follow them.
-  constexpr double stated_lower = 0.2, stated_log_stddev = 0.5;
+  constexpr double stated_lower = 0.2, stated_log_stddev = 0.5, stated_correlation = 0.8;
   const bool is_stated = observations.states_noise(k);
   if (is_stated) {
     h.lower = std::max(h.lower, stated_lower * observations.noise().stddev()[k]);
@@ -194,11 +194,10 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
   }
   h.value = std::clamp(observations.noise().stddev()[k], h.lower, h.upper);
   if (has_hyperpriors(protocol)) {
-    h.hyperprior = {HyperPrior::Form::log_normal, h.value, is_stated ? stated_log_stddev : Standard::noise_log_stddev};
-    if (!is_stated) {  // a start that is wrong is mostly wrong for all accelerations alike
-      h.hyperprior.family = fmt::format("noise#{}", group + 1);
-      h.hyperprior.correlation = Standard::noise_correlation;
-    }
+    // a start that is wrong is mostly wrong for all accelerations alike, and so are stated deviations
+    h.hyperprior = {HyperPrior::Form::log_normal, h.value, is_stated ? stated_log_stddev : Standard::noise_log_stddev,
+                    fmt::format("{}noise#{}", is_stated ? "stated " : "", group + 1),
+                    is_stated ? stated_correlation : Standard::noise_correlation};
   }
   return h;
 }
