@@ -463,6 +463,16 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
     }
   }
   for (const Hyperparameter& h : report.hyperparameters) {
+    constexpr double far_off = 5;  // as far below the stated deviations the lower bound is
+    const bool is_factor = h.kind == Hyperparameter::Kind::noise_stddev && h.unit.starts_with("stated deviation");
+    if (never_ran || !is_factor || !(h.value > far_off)) continue;
+    if (posterior.observations()[static_cast<std::size_t>(h.owner)].has_sums()) continue;  // add_window_note
+    notes.push_back(
+        fmt::format("{} = {:.2g}: the standard deviations in the log are too small by this factor, or the model "
+                    "lacks something",
+                    h.name, h.value));
+  }
+  for (const Hyperparameter& h : report.hyperparameters) {
     if (!h.is_system_parameter() || !h.at_bound() || never_ran) continue;
     if (report.uncertainty && std::isinf(report.uncertainty->stddev[&h - report.hyperparameters.data()])) continue;  // by chance
     notes.push_back(

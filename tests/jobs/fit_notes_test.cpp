@@ -60,6 +60,21 @@ TEST(FitNotes, NameWhatEndedAtABound) {
   EXPECT_THAT(notes_of(report, free), testing::SizeIs(2));
 }
 
+TEST(FitNotes, NameStatedDeviationsThatAreFarTooSmall) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
+  FitOptions nothing;
+  nothing.max_iterations = 0;
+  const Posterior posterior = fit(problem_of(constrained_cart(""), log), nothing).posterior;
+  FitReport report;
+  report.iterations = 10;
+  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddx", 7, 0.2, 100),
+                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddy", 4, 0.2, 100)};
+  EXPECT_THAT(notes_of(report, posterior), testing::IsEmpty());  // they are no factors
+  for (Hyperparameter& h : report.hyperparameters) h.unit = "stated deviation of " + h.name;
+  EXPECT_THAT(notes_of(report, posterior),
+              ElementsAre(StartsWith("noise of ddx = 7: the standard deviations in the log are too")));
+}
+
 TEST(FitNotes, TellOfFewValuesForWhatIsEstimated) {
   FitReport report;
   report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "m", 1, 0.5, 2)};
