@@ -463,7 +463,7 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
     }
   }
   for (const Hyperparameter& h : report.hyperparameters) {
-    constexpr double far_off = 5;  // as far below the stated deviations the lower bound is
+    constexpr double far_off = 5;  // the lower bound is as far off in the other direction
     const bool is_factor = h.kind == Hyperparameter::Kind::noise_stddev && h.unit.starts_with("stated deviation");
     if (never_ran || !is_factor || !(h.value > far_off)) continue;
     if (posterior.observations()[static_cast<std::size_t>(h.owner)].has_sums()) continue;  // add_window_note
