@@ -8,6 +8,9 @@ A cell is one mechanism, one N and one seed. Each prior is fitted to the same N 
 fresh states under held inputs, that lies between the least and the greatest of 39 sampled motions, which hold 38/40 of what is drawn as they
 are. Mechanisms are those of experiments/mechanisms and models,
 in the order of their names; every other one belongs to the half to choose on.
+
+With --along a model's one latent is replaced by those of ALONG: curves of a few features along the directions in which the unknown forces
+act, as of a user who knows where friction, drag and springs are.
 """
 
 import argparse
@@ -28,8 +31,31 @@ PRIORS = {
     "default optimised": ("", {"hyperparameters": "optimise"}),
     "and quadratic": ('kernel = "rq + linear + linear*linear"\nlengthscales = "per direction"\n', {}),
     "se + linear": ('kernel = "se + linear"\nlengthscales = "per direction"\n', {}),
+    "se + matern32 + linear": ('kernel = "se + matern32 + linear"\nlengthscales = "per direction"\n', {}),
+    "rq + linear": ('kernel = "rq + linear"\nlengthscales = "per direction"\n', {}),
     "rq + linear shared": ('kernel = "rq + linear"\n', {"hyperparameters": "integrate", "discrepancy": False}),
     "scikit-learn": ("", None),
+}
+# features: entries of the force that they act along
+ALONG = {
+    "cam_follower": {"da": "1, 0", "y": "0, 1"},
+    "cogging_screw": {"a, da": "1, 0", "ds": "0, 1"},
+    "crane": {"ds": "1, 0, 0", "v": "0, -dx, -dz"},
+    "double_pendulum": {"dq3": "0, 0, 1, 0, 0, 0", "dq6 - dq3": "0, 0, 0, 0, 0, 1"},
+    "duffing": {"q1 - q2": "1, -1", "q2": "0, 1"},
+    "hardening_link": {"sqrt(x1^2 + y1^2)": "-x1, -y1, 0, 0", "sqrt(dx1^2 + dy1^2)": "-dx1, -dy1, 0, 0",
+                       "sqrt(dx2^2 + dy2^2)": "0, 0, -dx2, -dy2"},
+    "helix_drag": {"v": "-dx, -dy, -dz"},
+    "pulley": {"z1": "1, 0, 0", "dz2": "0, 1, 0", "da": "0, 0, 1"},
+    "rolling_disk": {"sqrt(dx^2 + dy^2)": "-dx, -dy, 0, 0", "dh": "0, 0, 1, 0", "dr": "0, 0, 0, 1"},
+    "saturated_robot": {"u1": "cos(h), sin(h), -b", "u2": "cos(h), sin(h), b", "sqrt(dx^2 + dy^2)": "-dx, -dy, 0", "dh": "0, 0, 1"},
+    "scissor_lift": {"ds, u": "1, 0", "dy": "0, 1"},
+    "slider_crank": {"dq3": "0, 0, 1"},
+    "stribeck_bead": {"v": "-dx/v, -dz/v"},
+    "surface": {"speed": "-dq1, -dq2, -dq3"},
+    "turntable": {"v": "-rx, -ry"},
+    "two_link_tip": {"da": "1, 0", "da, db": "0, 1"},
+    "unicycle": {"speed": "-dq1, -dq2, 0"},
 }
 # no plain latent in every direction
 LEFT_OUT = {"massless_rod", "four_bar"}
@@ -43,10 +69,16 @@ def mechanisms(half):
     return {"choose": files[::2], "report": files[1::2], "all": files}[half]
 
 
-def with_prior(file, latent):
+def with_prior(file, latent, along):
     import gp2
 
     text = re.sub(r"^(kernel|lengthscales) *=.*\n", "", file.read_text(), flags=re.M)
+    if along:
+        quoted = lambda names: ", ".join(f'"{name.strip()}"' for name in names.split(","))
+        latents = [f'[[latent]]\nname = "{features}"\nfeatures = [{quoted(features)}]\n'
+                   f'directions = {{ force = [{", ".join(f"[{quoted(entry)}]" for entry in directions.split(","))}] }}\n\n'
+                   for features, directions in ALONG[file.stem].items()]
+        text = re.sub(r"^\[\[latent\]\]\n.*?(?=^\[)", lambda _: "".join(latents), text, flags=re.M | re.S)
     return gp2.System.parse(text.replace("[[latent]]\n", "[[latent]]\n" + latent), str(file))
 
 
@@ -80,12 +112,12 @@ def motion_coverage(system, posterior, starts, seed):
     return float(np.mean(shares)) if shares else math.nan
 
 
-def cell(file, prior, n, seed, threads, motions=0):
+def cell(file, prior, n, seed, threads, motions=0, along=False):
     import gp2
     import numpy as np
 
     latent, options = PRIORS[prior]
-    system = with_prior(file, latent)
+    system = with_prior(file, latent, along)
     began = time.monotonic()
     if options is None:
         posterior, motions = None, 0
@@ -192,6 +224,7 @@ def main():
     parser.add_argument("--priors", nargs="+", choices=PRIORS, default=["today", "default"])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--motions", type=int, default=0, help="how many of each cell")
+    parser.add_argument("--along", action="store_true", help="latents along given directions")
     parser.add_argument("--out", type=pathlib.Path, help="CSV file that cells are added to")
     parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file instead")
     arguments = parser.parse_args()
@@ -207,7 +240,7 @@ def main():
             for seed in arguments.seeds:
                 for file in mechanisms(arguments.half):
                     for prior in arguments.priors:
-                        figures = cell(file, prior, n, seed, arguments.threads, arguments.motions)
+                        figures = cell(file, prior, n, seed, arguments.threads, arguments.motions, arguments.along)
                         writer.writerow([file.stem, prior, n, seed, *(f"{f:.5g}" for f in figures)])
                         out.flush()
 

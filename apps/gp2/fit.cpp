@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <filesystem>
 #include <memory>
 
 #include <fmt/format.h>
@@ -279,6 +280,9 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_what_is_asked(arguments.request.problem, given);
   require_output(arguments.output, inputs_of(arguments));
   if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments), "--smoothed");
+  if (std::filesystem::weakly_canonical(arguments.smoothed) == std::filesystem::weakly_canonical(arguments.output)) {
+    throw InputError(fmt::format("--smoothed {}: the fit goes there (-o); write to another file", arguments.smoothed));
+  }
   const std::string checkpoint = arguments.request.checkpoint;
   if (!checkpoint.empty()) require_output(checkpoint, inputs_of(arguments), "--checkpoint");
   const std::shared_ptr<const Ranks> ranks = join_ranks();

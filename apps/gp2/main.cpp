@@ -168,7 +168,7 @@ int main(int argc, char** argv) {
   } catch (const gp2::NumericalError& error) {
     return failed(exit_numerical, fmt::format("numerical failure: {}", gp2::command::with_flags(error.what())));
   } catch (const std::bad_alloc&) {
-    return failed(exit_numerical, "numerical failure: not enough memory; take fewer points (--max-points)");
+    return failed(exit_numerical, "numerical failure: not enough memory");
   } catch (const std::exception& error) {
     return failed(exit_numerical, fmt::format("internal error: {}", error.what()));
   }

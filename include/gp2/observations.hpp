@@ -43,6 +43,8 @@ class Noise {
 
   /// σ_i (d) of state i under a σ that may differ from stddev(), as an estimate does.
   [[nodiscard]] Eigen::VectorXd at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
+  /// σ_ki of n states (d × n), n = N where there is a scale.
+  [[nodiscard]] Eigen::MatrixXd of_values(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index n) const;
 
   /// The noise of these states, in this order.
   [[nodiscard]] Noise take(const std::vector<int>& states) const;
@@ -121,6 +123,8 @@ class Observations {
 
   /// σ_i (d) at state i under a noise σ that may differ from noise().stddev(); ∞ where nothing is measured.
   [[nodiscard]] Eigen::VectorXd noise_at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
+  /// The same of all states (d × N).
+  [[nodiscard]] Eigen::MatrixXd noise_of_values(const Eigen::Ref<const Eigen::VectorXd>& stddev) const;
   /// Whether the values of row k came with standard deviations of their own, of which σ_k is a factor. A robust fit enlarges some
   /// scales and leaves the others at 1 where they did not.
   [[nodiscard]] bool states_noise(Eigen::Index k) const;

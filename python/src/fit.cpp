@@ -98,6 +98,7 @@ class LastProgress {
 std::vector<SideInformation> side_information_of(const py::object& also) {
   if (py::isinstance<PySideInformation>(also)) return side_information_of(py::make_tuple(also));
   std::vector<SideInformation> out;
+  if (also.is_none()) return out;
   for (const py::handle entry : also) {
     const std::string what = fmt::format("also[{}]", out.size());
     if (!py::isinstance<PySideInformation>(entry)) {

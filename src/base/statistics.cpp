@@ -64,4 +64,12 @@ double median(std::vector<double> values) {
   return *middle;
 }
 
+double usual_step(const Eigen::Ref<const VectorXd>& times) {
+  std::vector<double> steps;
+  for (Eigen::Index i = 1; i < times.size(); ++i) {
+    if (times[i] > times[i - 1]) steps.push_back(times[i] - times[i - 1]);
+  }
+  return steps.empty() ? 0 : median(std::move(steps));
+}
+
 }  // namespace gp2

@@ -16,6 +16,7 @@
 #include "base/checksum.hpp"
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -57,9 +58,6 @@ std::optional<std::string> take_cell(std::string_view& line) {
   return cell;
 }
 
-// a cell to show in a message
-std::string shown(const std::string& cell) { return cell.size() <= 60 ? cell : cell.substr(0, 57) + "..."; }
-
 // What from_chars makes of a whole cell.
 struct Parsed {
   double value = 0;
@@ -92,8 +90,8 @@ void refuse_cell(const std::string& cell, const std::string& place) {
   const Parsed parsed = parse_number(cell);
   if (trim(cell).empty()) fail("the cell is empty; a number is needed here");
   if (parsed.is_whole && parsed.error == std::errc::result_out_of_range)
-    fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", shown(cell)));
-  fail(fmt::format("'{}' is not a finite number", shown(cell)));
+    fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", shortened(cell)));
+  fail(fmt::format("'{}' is not a finite number", shortened(cell)));
 }
 
 // names that are there, once each, and not too many
@@ -120,7 +118,7 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
     if (header[k].size() > CsvTable::max_name_length) {
       throw InputError(
           fmt::format("{}: the name of column {} has {} bytes, at most {} are allowed: is this no table? It begins '{}'", where,
-                      k + 1, header[k].size(), CsvTable::max_name_length, shown(header[k])));
+                      k + 1, header[k].size(), CsvTable::max_name_length, shortened(header[k])));
     }
     if (!seen.insert(header[k]).second) {
       throw InputError(fmt::format("{}: the column '{}' stands twice in the header; rename or remove one", where, header[k]));
@@ -377,7 +375,7 @@ std::optional<std::vector<double>> plain_cells(std::string_view lines, std::size
   return cells;
 }
 
-// What who reads a piece tells the others.
+// Result of one reader, sent to the other processes.
 struct ReadPiece {
   Checksum checksum;
   std::optional<std::vector<double>> cells;
@@ -592,8 +590,8 @@ void CsvWriter::begin_cell() {
 
 void CsvWriter::add(std::string_view cell) {
   if (cell.find('\n') != std::string_view::npos) {
-    throw InputError(fmt::format("'{}' has a line break in it, but a row of a CSV file is one line here: remove the break",
-                                 shown(std::string(cell))));
+    throw InputError(
+        fmt::format("'{}' has a line break in it, but a row of a CSV file is one line here: remove the break", shortened(cell)));
   }
   begin_cell();
   const bool plain =

@@ -165,6 +165,14 @@ MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
   return values;
 }
 
+bool LogReader::measures(const std::string& name) const {
+  const int column = find(name);
+  for (int row = 0; column >= 0 && row < table_.n_rows(); ++row) {
+    if (!table_.is_empty(row, column)) return true;
+  }
+  return false;
+}
+
 std::string LogReader::stddev_column(const std::string& name) const {
   const int column = find(name);
   if (column < 0) return "";

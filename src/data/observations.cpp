@@ -55,6 +55,12 @@ VectorXd Noise::at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
   return noise;
 }
 
+MatrixXd Noise::of_values(const Eigen::Ref<const VectorXd>& stddev, Index n) const {
+  MatrixXd noise = stddev.replicate(1, n);
+  if (has_scale()) noise.array() *= scale().array();
+  return noise;
+}
+
 Noise Noise::take(const std::vector<int>& states) const {
   return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale()(Eigen::all, states)) : MatrixXd());
 }
@@ -198,6 +204,10 @@ VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index 
     if (std::isnan(values()(k, i))) noise[k] = std::numeric_limits<double>::infinity();
   }
   return noise;
+}
+
+MatrixXd Observations::noise_of_values(const Eigen::Ref<const VectorXd>& stddev) const {
+  return values().array().isNaN().select(std::numeric_limits<double>::infinity(), noise_.of_values(stddev, n_data()));
 }
 
 bool Observations::states_noise(Index k) const {

@@ -174,6 +174,7 @@ FitFile fit_from(ParsedJson& json, const ModelCode& code) {
   fit.model = model_from(json.at("model"), code);
   bool code_is_used = static_cast<bool>(fit.model.code);
   fit.prior_options = prior_from(json.at("prior"));
+  fit.library = json.value("library", "");
   json.at("data_source").get_to(fit.data_source);
   if (json.contains("logs")) fit.logs = logs_from(json.at("logs"));
   if (json.contains("options")) {

@@ -98,9 +98,10 @@ Model model_from(const ParsedJson& json, const ModelCode& given) {
 }
 
 Json prior_json(const FitPriorOptions& options) {
-  Json json = {{"mean", name_of(means, options.mean)},   {"directions", name_of(directions, options.base)},
-               {"raw_angles", options.raw_angles},       {"kernel", options.kernel},
-               {"per_direction", options.per_direction}, {"feature_centres", options.feature_centres}};
+  Json json = {{"mean", name_of(means, options.mean)},      {"directions", name_of(directions, options.base)},
+               {"raw_angles", options.raw_angles},          {"kernel", options.kernel},
+               {"kernel_along", options.kernel_along},      {"per_direction", options.per_direction},
+               {"feature_centres", options.feature_centres}};
   if (options.baseline) json["baseline"] = baseline_json(*options.baseline);
   if (options.discrepancy) json["discrepancy"] = discrepancy_json(*options.discrepancy);
   return json;
@@ -118,6 +119,7 @@ FitPriorOptions prior_from(const ParsedJson& json) {
     json.at("kernel").get_to(options.kernel);
     json.at("per_direction").get_to(options.per_direction);
   }
+  options.kernel_along = json.value("kernel_along", options.kernel);  // since format 13
   if (json.contains("feature_centres")) {
     if (!json.at("feature_centres").is_object()) throw InputError("feature_centres must be an object of numbers");
     for (const auto& [feature, centre] : json.at("feature_centres").items()) {

@@ -11,6 +11,7 @@
 
 #include "base/not_a_number.hpp"
 #include "base/shape.hpp"
+#include "base/stop.hpp"
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/leave_one_out.hpp"
@@ -138,7 +139,7 @@ double training_spread(const std::vector<Observations>& observations, const Obse
     values.insert(values.end(), observed.begin(), observed.end());
   });
   if (values.empty()) return not_a_number;
-  return row_stddev(Eigen::Map<Eigen::RowVectorXd>(values.data(), std::ssize(values)))[0];
+  return row_spread(Eigen::Map<Eigen::RowVectorXd>(values.data(), std::ssize(values)))[0];
 }
 
 // Where A ddq = b alone decides an entry of ddq (nq × N): its row of T, in the metric of M, is what rounding leaves of it.
@@ -312,10 +313,7 @@ Evaluation::Part scores_of(const std::vector<Observations>& judged, const Observ
 std::vector<MatrixXd> noise_of_groups(const Posterior& posterior) {
   std::vector<MatrixXd> noise;
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
-    const Observations& group = posterior.observations()[g];
-    MatrixXd& one = noise.emplace_back(group.view().size(), group.n_data());
-    const VectorXd stddev = posterior.noise_stddev(g);
-    for (Index i = 0; i < group.n_data(); ++i) one.col(i) = group.noise_at(stddev, i);
+    noise.push_back(posterior.observations()[g].noise_of_values(posterior.noise_stddev(g)));
   }
   return noise;
 }
@@ -371,6 +369,7 @@ bool has_stretches(const Posterior& posterior, bool has_time_order) {
 }  // namespace
 
 CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& judged, bool has_time_order) {
+  if (judged.empty()) throw InputError("cross_validate: the posterior has no observations to leave out");
   const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
   std::vector<LeftOutScores> of_views;
   for (const Observed& of : observed_views(judged)) of_views.push_back(scores_of(posterior, judged, left_out, of));
@@ -445,7 +444,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   const VectorXd distance = posterior.distance_from_data(all, states, options.n_threads);
   Scores whole(e.rmse.size()), near(e.rmse.size()), far(e.rmse.size());
   posterior.for_each_marginal(all, states, options.n_threads, [&](Index first, const Posterior::Marginal& prediction) {
-    if (options.stop != nullptr && *options.stop) throw NumericalError("stopped on request");
+    require_not_stopped(options.stop);
     const MatrixXd stddev = prediction.stddev();
     for (Index i = 0; i < stddev.cols(); ++i) {
       const Index state = first + i;
@@ -472,7 +471,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
     add_largest(max_constraint_error(system, states_here, parameters, prediction.mean), e.max_constraint_error_fitted);
   });
   static_cast<Calibration&>(e) = whole.calibration();
-  const double spread = row_stddev(targets).norm();
+  const double spread = row_spread(targets).norm();
   e.rmse = whole.rmse();
   double normalised = 0;
   for (Index k = 0; k < e.rmse.size(); ++k) {

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <numeric>
 
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/posterior.hpp"
 
@@ -13,14 +14,12 @@ using Eigen::MatrixXd;
 
 namespace {
 
-// of the states that were observed on the prior's own system, evenly taken
+// of the states that were observed, evenly taken
 MatrixXd some_observed_states(const Posterior& posterior, Index most) {
-  Index n = 0;
-  for (const Observations& group : posterior.observations()) n += group.view().other_system ? 0 : group.n_data();
+  const Index n = n_states(posterior.observations());
   MatrixXd all(posterior.prior().system->state_names().size(), n);
   Index first = 0;
   for (const Observations& group : posterior.observations()) {
-    if (group.view().other_system) continue;
     all.middleCols(first, group.n_data()) = group.states();
     first += group.n_data();
   }

@@ -13,7 +13,7 @@ struct KeptStates {
   static constexpr int most = 5000;
 
   std::vector<std::int64_t> n_states;        // per Observations: all that it is conditioned on
-  int step = 1;                              // every so manieth is kept, a power of two
+  int step = 1;                              // every step-th is kept, a power of two
   std::vector<std::vector<int>> stretch_of;  // per Observations: the stretch of each state that is kept; empty: not known
   /// Per Observations: as which share the likelihood of each state that is kept counts; empty: all wholly.
   std::vector<std::vector<double>> share_of;

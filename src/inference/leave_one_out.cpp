@@ -397,9 +397,7 @@ LeftOut mixture_of(const Posterior& posterior, const std::vector<OfComponent>& c
       values.push_back(&one.values[g]);
       rows.push_back(&one.rows[g]);
       if (!one.stretches.empty()) stretches.push_back(&one.stretches[g]);
-      const VectorXd stddev = posterior.component(static_cast<int>(k)).values().noise_stddev[g];
-      MatrixXd& of_values = noise.emplace_back(observed.values().rows(), observed.n_data());
-      for (int i = 0; i < observed.n_data(); ++i) of_values.col(i) = observed.noise_at(stddev, i);
+      noise.push_back(observed.noise_of_values(posterior.component(static_cast<int>(k)).values().noise_stddev[g]));
     }
     out.values.push_back(mixed(values, [&](std::size_t k, Index r, Index i) {
       const double error = observed.values()(r, i) - values[k]->mean(r, i);

@@ -226,8 +226,8 @@ class MarginalBlock {
 // Mean and covariance of a mixture of equal weights (theory.md, T31); of one component they are its own.
 template <typename Gaussian, typename AddSquare>
 Gaussian mixed(std::vector<Gaussian> components, const AddSquare& add_square) {
+  if (components.size() == 1) return std::move(components.front());
   Gaussian out = components.front();
-  if (components.size() == 1) return out;
   for (std::size_t k = 1; k < components.size(); ++k) {
     out.mean += components[k].mean;
     out.covariance += components[k].covariance;

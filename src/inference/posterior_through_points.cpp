@@ -144,7 +144,7 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
   const bool is_new = group == observations.size();
   if (is_new) kept->n_states.push_back(0);
   kept->stretch_of.clear();  // what is new is of none
-  // every so manieth of all
+  // every k-th of all
   std::int64_t& n_states = kept->n_states[group];
   std::vector<int> states;
   for (int i = 0; i < more.n_data(); ++i, ++n_states) {

@@ -50,8 +50,9 @@ void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector
     const LatentPosterior::Basis& from = posterior.latents()[term.latent];
     const Index n = from.kernel.n_points(), n_rows = simd::padded<T>(n);
     LatentData& latent = latents_.emplace_back();
+    const MatrixXd weights = from.beta * term.C.transpose();
     if (term.is_potential) {
-      latent.exact_weights = from.beta * term.C.transpose();
+      latent.exact_weights = weights;
     } else if (term.kernel.is_squared_exponential()) {
       MatrixXd points = term.kernel.scaled().topRows(n);
       latent.centre = VectorXd::Zero(points.cols());
@@ -59,9 +60,9 @@ void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector
       points.rowwise() -= latent.centre.transpose();
       latent.points = stored<T>(points, n_rows);
     } else if (std::is_same_v<T, float>) {
-      latent.exact_weights = from.beta * term.C.transpose();
+      latent.exact_weights = weights;
     }
-    latent.weights = stored<T>((from.beta * term.C.transpose()).topRows(n), n_rows);
+    if (!term.is_potential) latent.weights = stored<T>(weights.topRows(n), n_rows);
     if (stddev) latent.Z = stored<T>(from.Z.topRows(n), n_rows);
   }
   if (stddev) store_triangle(posterior);

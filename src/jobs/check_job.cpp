@@ -284,7 +284,7 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   const int n_repeated = n_repeated_rows({{log.states, log.accelerations}});
   if (n_repeated * 20 > log.states.cols()) {
     findings.push_back(
-        {Level::warning, fmt::format("{} of {} rows repeat another one to the last digit: they are not independent measurements, "
+        {Level::warning, fmt::format("{} of {} rows repeat another one to twelve digits: they are not independent measurements, "
                                      "and standard deviations will be too small; keep each once",
                                      n_repeated, log.states.cols())});
   }
@@ -379,7 +379,7 @@ std::vector<Finding> check(const Model& model, const CsvTable* log, const CheckO
     check_mechanics(model, generate(model, {100, 1, Eigen::VectorXd::Zero(model.system->nq())}).states, findings);
   } else {
     findings.push_back(
-        {Level::warning, "no `data`, and neither [sampling] nor [motion] in the model: there are no states to check"});
+        {Level::warning, "no `data`, and the model has no [truth] with [sampling] or [motion]: there are no states to check"});
   }
   return findings;
 }

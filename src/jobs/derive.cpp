@@ -226,7 +226,7 @@ class Deriver {
     }
     const double span = episode.distinct.back();
     if (span * options_.rate > most_rows) {
-      throw InputError(fmt::format("rate: {} rows per second would be {:.3g} rows; at most {:.0e} are written", options_.rate,
+      throw InputError(fmt::format("`rate`: {} rows per second would be {:.3g} rows; at most {:.0e} are written", options_.rate,
                                    span * options_.rate, most_rows));
     }
     const auto n = static_cast<Index>(std::floor(span * options_.rate * (1 + 1e-12) + 1e-9)) + 1;
@@ -532,12 +532,13 @@ class Deriver {
     for (const std::string& name : options_.keep) {
       data_.kept_names.push_back(name);
       std::vector<std::string>& cells = data_.kept.emplace_back();
+      const int column = log_.find(name);
       for (const Episode& episode : episodes_) {
         double before = not_a_number;
         for (std::size_t k = 0; k < episode.rows.size(); ++k) {
           if (episode.times[k] == before) continue;
           before = episode.times[k];
-          cells.push_back(log_.cell(episode.rows[k], log_.find(name)));
+          cells.push_back(log_.cell(episode.rows[k], column));
         }
       }
     }

@@ -53,9 +53,10 @@ void require_options(const ExciteRequest& request) {
     throw InputError(fmt::format("`duration`: must be positive, got {}", request.duration));
   }
   if (request.n_harmonics < 1) throw InputError(fmt::format("`harmonics`: must be at least 1, got {}", request.n_harmonics));
-  if (request.n_rows < 4 * request.n_harmonics) {
-    throw InputError(fmt::format("`rows`: must be at least {}, four for each of the {} harmonics, got {}",
-                                 4 * request.n_harmonics, request.n_harmonics, request.n_rows));
+  constexpr int rows_per_harmonic = 4, most_rows = 1'000'000;
+  if (request.n_rows / rows_per_harmonic < request.n_harmonics || request.n_rows > most_rows) {
+    throw InputError(fmt::format("`rows`: must be at least four for each of the {} harmonics and at most {}, got {}",
+                                 request.n_harmonics, most_rows, request.n_rows));
   }
   if (request.n_motions < 1) throw InputError(fmt::format("`motions`: must be at least 1, got {}", request.n_motions));
   require_threads(request.threads);
@@ -144,7 +145,7 @@ class InputFamily {
     }
   }
 
-  // of the inputs that limits leave some room
+  // of the inputs whose limits differ
   [[nodiscard]] Index n_coefficients() const {
     return basis_.rows() * std::count_if(limits_.begin(), limits_.end(), [](const Limit& one) { return one.half_width() > 0; });
   }

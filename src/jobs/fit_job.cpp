@@ -30,8 +30,6 @@
 
 namespace gp2 {
 
-namespace {
-
 void require_in_range(const FitRequest& request) {
   const auto require_positive = [](const char* name, const auto& value) {
     if (value && !(*value > 0)) throw InputError(fmt::format("`{}`: must be positive, got {}", name, *value));
@@ -40,6 +38,10 @@ void require_in_range(const FitRequest& request) {
     if (value && *value < 0) throw InputError(fmt::format("`{}`: must not be negative, got {}", name, *value));
   };
   require_positive("restarts", request.restarts);
+  constexpr int most_restarts = 100'000;
+  if (request.restarts.value_or(0) > most_restarts) {
+    throw InputError(fmt::format("`restarts`: must be at most {}, got {}", most_restarts, *request.restarts));
+  }
   require_not_negative("max_iterations", request.max_iterations);
   require_positive("max_points", request.problem.max_points);
   require_positive("train_on", request.train_on);
@@ -57,6 +59,8 @@ void require_in_range(const FitRequest& request) {
         fmt::format("`inducing`: expected a whole number from 1 to 100000, 'auto' or 'none', got '{}'", *request.inducing));
   }
 }
+
+namespace {
 
 // The options of the optimiser: those asked for or, where nothing was, those of the problem, which the request then says too.
 FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
@@ -222,7 +226,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
 }
 
 // What to judge a fit by: of a robust one without the values that it distrusts, which are no measure of its predictions. Of many states
-// every so manieth is kept, whose numbers and lines are those of the log.
+// every k-th is kept, whose numbers and lines are those of the log.
 JudgedData judged_data(const Posterior& posterior, const FitReport& report, const std::vector<std::vector<int>>& lines = {}) {
   JudgedData judged{posterior.observations(), {}};
   const std::shared_ptr<const InducingSummary> summary = posterior.summary();

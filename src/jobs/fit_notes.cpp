@@ -109,9 +109,7 @@ namespace {
 std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, const JudgedData& judged, std::size_t group) {
   const Observations& of = judged.observations[group];
   const Prior& prior = prior_of(posterior.prior(), of.view());
-  const VectorXd noise_stddev = posterior.noise_stddev(group);
-  MatrixXd noise(of.view().size(), of.n_data());
-  for (int i = 0; i < of.n_data(); ++i) noise.col(i) = of.noise().at(noise_stddev, i);
+  const MatrixXd noise = of.noise().of_values(posterior.noise_stddev(group), of.n_data());
   std::vector<ConstraintResidual> residuals =
       constraint_residuals(posterior, of.view().other_system, of.states(), of.view().rows, of.values(), noise);
   if (!of.noise().is_estimated() || of.has_sums() || prior.system->has_constraint_noise()) return residuals;
@@ -228,11 +226,13 @@ bool has_far_values(const CrossValidation& of) {
 // Whether stretches that were left out are predicted much worse than the noise and single values, or somewhat worse while
 // the fit is too sure of itself. What the model lacks is taken up between rows that are known, and told by stretches that are not.
 bool predicts_stretches_worse(const CrossValidation& of) {
-  constexpr double several = 3, twice = 2, worth_a_word = 0.01;  // times the noise; the error of single values; of the spread
+  constexpr double several = 3, twice = 2;  // times the noise; the error of single values
   constexpr double somewhat = 1.3, low_coverage = 0.9;
   if (!of.stretches) return false;
   const Evaluation::Part &values = of.values, &stretches = *of.stretches;
   const double error = stretches.nrmse;
+  // of the spread; a fit that knows how far it errs there may err more
+  const double worth_a_word = stretches.coverage95 >= 0.95 ? 0.1 : 0.01;
   if (error > std::max({several * of.nrmse_of_noise, twice * values.nrmse, worth_a_word})) return true;
   if (error > somewhat * std::max(of.nrmse_of_noise, values.nrmse) && stretches.coverage95 < low_coverage) {
     return stretches.n >= enough_rows;

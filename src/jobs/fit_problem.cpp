@@ -454,7 +454,7 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
     const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
     if (h.kind != Hyperparameter::Kind::noise_stddev || !at_lower || never_ran) continue;
     const Observations& group = posterior.observations()[static_cast<std::size_t>(h.owner)];
-    if (h.unit.starts_with("stated deviation") && !has_dependent_columns(posterior, group)) {
+    if (group.states_noise(h.index) && !has_dependent_columns(posterior, group)) {
       notes.push_back(
           fmt::format("{} ended at the lower bound: the standard deviations in the log are {:.2g} times too large, or more",
                       h.name, 1 / h.lower));
@@ -464,9 +464,9 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
   }
   for (const Hyperparameter& h : report.hyperparameters) {
     constexpr double far_off = 5;  // the lower bound is as far off in the other direction
-    const bool is_factor = h.kind == Hyperparameter::Kind::noise_stddev && h.unit.starts_with("stated deviation");
-    if (never_ran || !is_factor || !(h.value > far_off)) continue;
-    if (posterior.observations()[static_cast<std::size_t>(h.owner)].has_sums()) continue;  // add_window_note
+    if (never_ran || h.kind != Hyperparameter::Kind::noise_stddev || !(h.value > far_off)) continue;
+    const Observations& group = posterior.observations()[static_cast<std::size_t>(h.owner)];
+    if (!group.states_noise(h.index) || group.has_sums()) continue;  // of sums: add_window_note
     notes.push_back(
         fmt::format("{} = {:.2g}: the standard deviations in the log are too small by this factor, or the model "
                     "lacks something",

@@ -326,7 +326,8 @@ FitRequest LearnedLog::request(FitRequest asked, const std::string& name) const 
 
 LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, const RawFitOptions& options,
                             const std::atomic<bool>* stop) {
-  if (options.most_passes < 0) throw InputError(fmt::format("passes: must not be negative, got {}", options.most_passes));
+  require_in_range(request);
+  if (options.most_passes < 0) throw InputError(fmt::format("`passes`: must not be negative, got {}", options.most_passes));
   const System& system = *request.model.system;
   DeriveOptions smoothing = options.derive;
   smoothing.columns = request.problem.columns;
@@ -354,7 +355,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     quick.standard_errors = quick.thin = quick.problem.robust = false;
     const FitJob job = prepare_fit(std::move(quick));
     const FitOutcome fit = run_fit(job, {}, stop);
-    if (stop != nullptr && *stop) throw NumericalError("stopped while learning from the raw log");
+    if (is_set(stop)) throw NumericalError("stopped while learning from the raw log");
     actuators = fit.file.model.actuators;
     last = {fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole)};
   };

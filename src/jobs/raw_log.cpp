@@ -121,13 +121,13 @@ int jumps_of(const std::vector<Measurement>& angles) {
 
 void check_options(const DeriveOptions& options) {
   if (!(options.rate >= 0) || !std::isfinite(options.rate))
-    throw InputError(fmt::format("rate: must be positive, got {}", options.rate));
-  if (options.every < 1) throw InputError(fmt::format("every: must be at least 1, got {}", options.every));
+    throw InputError(fmt::format("`rate`: must not be negative, got {}", options.rate));
+  if (options.every < 1) throw InputError(fmt::format("`every`: must be at least 1, got {}", options.every));
   if (!(options.outlier_threshold >= 0)) {
-    throw InputError(fmt::format("outlier threshold: must not be negative, got {}", options.outlier_threshold));
+    throw InputError(fmt::format("`outlier_threshold`: must not be negative, got {}", options.outlier_threshold));
   }
   if (options.rate > 0 && !options.keep.empty()) {
-    throw InputError("keep: rows of an even rate are not those of the log; leave out either");
+    throw InputError("`keep` copies rows of the log, and those of an even `rate` are others: leave out either");
   }
 }
 
@@ -179,7 +179,8 @@ void RawLog::find_columns() {
   }
   for (const std::string& name : options_.keep) {
     if (log_.find(name) < 0) {
-      throw InputError(fmt::format("keep: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
+      throw InputError(
+          fmt::format("`keep`: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
     }
   }
   for (const auto& [name, found] : reader_.aliases_used()) notes.push_back(fmt::format("{} is the column '{}'", name, found));
@@ -190,10 +191,10 @@ void RawLog::find_episodes() {
   const int column = log_.find(name);
   if (column < 0 && !options_.episode_column.empty()) {
     throw InputError(
-        fmt::format("episode column: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
+        fmt::format("`episode`: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
   }
   if (column < 0 && !options_.episodes.empty()) {
-    throw InputError(fmt::format("episodes: {} has no column 'episode' to choose from; name it", log_.name()));
+    throw InputError(fmt::format("`episodes`: {} has no column 'episode' to choose from; name it by `episode`", log_.name()));
   }
   if (column >= 0) episode_column_ = name;
   std::set<std::string> known;
@@ -205,7 +206,8 @@ void RawLog::find_episodes() {
   const std::vector<std::string> all_wanted = without_ranges(options_.episodes);
   for (const std::string& wanted : all_wanted) {
     if (!known.contains(wanted)) {
-      throw InputError(fmt::format("episodes: {} has no episode '{}'; it has: {}", log_.name(), wanted, fmt::join(labels, ", ")));
+      throw InputError(
+          fmt::format("`episodes`: {} has no episode '{}'; it has: {}", log_.name(), wanted, fmt::join(labels, ", ")));
     }
   }
   const std::set<std::string> taken(all_wanted.begin(), all_wanted.end());
@@ -391,6 +393,10 @@ void RawLog::require_motion(const Episode& episode, int column, const Channel& c
   if (channel.measurements.size() < least_rows) {
     throw InputError(fmt::format("{}: {} samples are too few to find a motion in; {} are needed{}", where,
                                  channel.measurements.size(), least_rows, way_out));
+  }
+  if (channel.measurements.front().time == channel.measurements.back().time) {
+    throw InputError(fmt::format("{}: all {} samples have t = {}{}", where, channel.measurements.size(),
+                                 channel.measurements.front().time, way_out));
   }
   const double first = channel.measurements.front().value;
   if (std::all_of(channel.measurements.begin(), channel.measurements.end(),

@@ -177,6 +177,10 @@ std::vector<int> measured_rows(Readings& readings, const std::vector<std::string
   for (int i = 0; i < log.n_rows(); ++i) {
     if (!values.col(i).array().isNaN().all()) rows.push_back(i);
   }
+  if (rows.empty()) {
+    throw InputError(fmt::format("{}: no row has a value and, where the log has a column for it, its standard deviation: {}",
+                                 log.name(), fmt::join(missing, ", ")));
+  }
   const std::size_t n_left_out = static_cast<std::size_t>(log.n_rows()) - rows.size();
   if (n_left_out > 0) notes.push_back(fmt::format("{}: {} rows left out: they have no measured value", log.name(), n_left_out));
   return rows;
@@ -344,7 +348,7 @@ void note_repeats(const Readings& readings, const CsvTable& log, std::vector<std
   const int n_repeated = n_repeated_rows({{readings.states, readings.values}});
   if (n_repeated * 20 <= log.n_rows()) return;
   notes.push_back(fmt::format(
-      "warning: {}: {} of {} rows repeat another one to the last digit: standard deviations will be too small; keep each once",
+      "warning: {}: {} of {} rows repeat another one to twelve digits: standard deviations will be too small; keep each once",
       log.name(), n_repeated, log.n_rows()));
 }
 
@@ -581,7 +585,7 @@ void note_shared_rows(const std::vector<Observations>& known, const std::vector<
   const int n = n_shared(groups) - n_before;
   if (n * 20 <= n_states(more)) return;
   notes.push_back(fmt::format(
-      "warning: {} of {} rows are also in another log, to the last digit: standard deviations will be too small; give each once",
+      "warning: {} of {} rows are also in another log, to twelve digits: standard deviations will be too small; give each once",
       n, n_states(more)));
 }
 
@@ -892,7 +896,7 @@ WholeLog read_whole_log(const Model& model, LogReader& reader) {
   log.stddev = log.accelerations;
   Index row = 0;
   for (const std::string& name : system.acceleration_names()) {
-    if (reader.has(name)) {
+    if (reader.measures(name)) {
       log.accelerations.row(row) = reader.measurements({name});
     } else {
       log.missing.push_back(name);

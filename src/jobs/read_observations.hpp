@@ -58,7 +58,7 @@ struct MeasuredRows {
   const Eigen::MatrixXd &states, &values;
 };
 
-/// How many rows of some logs are those of an earlier one to the last bit.
+/// How many rows of some logs are those of an earlier one to twelve digits.
 int n_repeated_rows(const std::vector<MeasuredRows>& logs);
 
 /// Warns where more than a twentieth of the rows of more logs are those of another of them, or of a log that is known, in whatever order.

@@ -113,11 +113,8 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
     if (!group.view().is_of_ddq()) continue;
-    const VectorXd noise_stddev = posterior.noise_stddev(g);
-    MatrixXd noise(group.view().size(), group.n_data());
-    for (int i = 0; i < group.n_data(); ++i) noise.col(i) = group.noise().at(noise_stddev, i);
-    ReportData data =
-        data_at(posterior, group.states(), group.view().rows, group.values(), std::move(noise), group.view().other_system);
+    ReportData data = data_at(posterior, group.states(), group.view().rows, group.values(),
+                              group.noise().of_values(posterior.noise_stddev(g), group.n_data()), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
     data.is_of_other_system = elsewhere;
@@ -526,8 +523,8 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   if (!request.data && request.system) throw InputError("`system` is that of `data`, which is not given");
   Report report;
   report.label = fit.model.system->name();
+  report.library = fit.library.empty() ? version() : fit.library;
   report.fit = std::move(fit);
-  report.library = version();
   report.data = training_data(report.fit, posterior);
   report.cross_validation = cross_validate(report.fit, posterior);
   report.notes = notes_of_fit(report.fit, posterior, report.cross_validation);
@@ -548,12 +545,10 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
 }
 
 Report collect_report(const std::filesystem::path& fit, const ReportRequest& request, std::vector<std::string>& notes) {
-  const std::string text = read_file(fit);
-  FitFile file = FitFile::parse(text, fit.string());
+  FitFile file = FitFile::read(fit);
   const Posterior posterior = file.posterior();
   Report report = collect_report(std::move(file), posterior, request, notes);
   report.label = fit.string();
-  report.library = nlohmann::json::parse(text).value("library", "");
   report.file_date = date_of(fit);
   return report;
 }

@@ -49,11 +49,7 @@ std::vector<std::string> missing_entries(const System& system, const std::vector
 }
 
 Part longest_part(const Eigen::Ref<const VectorXd>& times, const std::vector<std::string>& episodes) {
-  std::vector<double> steps;
-  for (Index i = 1; i < times.size(); ++i) {
-    if (times[i] > times[i - 1]) steps.push_back(times[i] - times[i - 1]);
-  }
-  const double usual = steps.empty() ? 0 : median(std::move(steps));
+  const double usual = usual_step(times);
   Part longest{0, 0}, current{0, 1};
   const auto end = [&](Index next) {
     if (current.second > longest.second) longest = current;
@@ -319,10 +315,7 @@ Rollout roll_out(const FitSystem& system, const Posterior& posterior, const Matr
   Rollout out;
   try {
     Roll(system, posterior).run(states, episodes, out);
-  } catch (const InputError& error) {
-    out = {};
-    out.reason = error.what();
-  } catch (const NumericalError& error) {
+  } catch (const Error& error) {
     out = {};
     out.reason = error.what();
   }

@@ -195,11 +195,8 @@ class Shooter {
   // where the log goes on without a break
   void cut(const CsvTable& log, const ShootRequest& request) {
     const Index n = states_.cols();
-    std::vector<double> steps;
-    for (Index i = 1; i < n; ++i) {
-      if (const double step = times()[i] - times()[i - 1]; step > 0) steps.push_back(step);
-    }
-    const double usual = steps.empty() ? 0 : median(steps);
+    const double usual = usual_step(times());
+    if (usual == 0) throw InputError(fmt::format("{}: t never increases from one row to the next", log.name()));
     const int episode = log.find("episode");
     find_clearance();
     std::vector<std::pair<Index, Index>> parts;
@@ -218,7 +215,8 @@ class Shooter {
       throw InputError(fmt::format("`duration`: must be positive and finite, got {}", duration_));
     if (request.most_stretches < 1)
       throw InputError(fmt::format("`stretches`: must be at least 1, got {}", request.most_stretches));
-    const auto size = static_cast<Index>(std::floor(duration_ / std::max(usual, std::numeric_limits<double>::min()) + 1e-9)) + 1;
+    // one that no part holds is as good as any longer one
+    const auto size = static_cast<Index>(std::min(std::floor(duration_ / usual + 1e-9), static_cast<double>(longest))) + 1;
     std::vector<Stretch> found;
     for (const auto& [first, rows] : parts) {
       for (Index i = first; i + size <= first + rows;) {

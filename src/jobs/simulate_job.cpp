@@ -80,7 +80,8 @@ StartingPoint start_by_names(const System& system, const std::map<std::string, d
 // What the first row of a log has of coordinates, velocities and t.
 StartingPoint start_of_log(const Model& model, const CsvTable& table, const std::map<std::string, std::string>& columns) {
   const System& system = *model.system;
-  LogReader reader(table, system, columns);
+  const CsvTable first_row = table.first_rows(1);
+  LogReader reader(first_row, system, columns);
   const std::vector<std::string> names = system.state_names();
   StartingPoint start = empty_start(system);
   std::vector<std::string> found;

@@ -108,20 +108,13 @@ double left_out(const Posterior& posterior) {
   return summary ? 0.5 * summary->components.front().all.trace : 0;
 }
 
-// σ of each value, ∞ where nothing is measured (d × n).
-MatrixXd noise_of_values(const Observations& observations) {
-  MatrixXd noise(observations.values().rows(), observations.n_data());
-  for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = observations.noise_at(observations.noise().stddev(), i);
-  return observations.values().array().isNaN().select(std::numeric_limits<double>::infinity(), noise);
-}
-
 // Noise that is given or stated must be usable, as that of a fit, whose accelerations tell how far they spread. Points that stand for
 // observations need no such limit.
 void require_usable_noise(const Posterior& posterior, const Observations& more, const CsvTable& log, const std::vector<int>& rows,
                           bool is_given) {
   if (posterior.summary() || more.n_data() == 0) return;
   const std::vector<std::string> names = more.view().names(*posterior.prior().system);
-  const MatrixXd noise = noise_of_values(more);
+  const MatrixXd noise = more.noise_of_values(more.noise().stddev());
   for (const Observations& group : posterior.observations()) {
     if (!(group.view() == more.view()) || group.has_sums() || group.n_data() < 2) continue;
     const VectorXd spread = row_stddev(group.values());
@@ -194,7 +187,7 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   const std::vector<int> taken = evenly_and_extreme(more, most_states);
   const Observations some = more.take(taken);
   const Posterior::Marginal predicted = posterior.marginal(some.view(), some.states(), /*n_threads=*/0);
-  const MatrixXd noise = with_slip(posterior, some.view(), some.states(), noise_of_values(some));
+  const MatrixXd noise = with_slip(posterior, some.view(), some.states(), some.noise_of_values(some.noise().stddev()));
   const MatrixXd variance = predicted.stddev().cwiseAbs2() + noise.cwiseAbs2();
   const MatrixXd z = (some.values() - predicted.mean).cwiseQuotient(variance.cwiseSqrt());
   // what follows a machine row by row does not wait for distances without a cause
@@ -328,12 +321,8 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
         fmt::format("warning: {}: nothing is learned from it: no row has a measured value and known acting inputs", log.name()));
   }
   noise = noise.take(rows);
-  Observations more{read.states(Eigen::all, rows),
-                    std::move(view),
-                    read.accelerations(Eigen::all, rows),
-                    noise.stddev(),
-                    false,
-                    noise.has_scale() ? noise.scale() : MatrixXd()};
+  Observations more{read.states(Eigen::all, rows), std::move(view), read.accelerations(Eigen::all, rows),
+                    Noise(noise.stddev(), false, noise.scale())};
   require_usable_noise(posterior, more, log, rows, request.noise_stddev.has_value());
   if (log.file() && fit.has_learned(*log.file())) {
     notes.push_back(fmt::format("warning: {} is already in the fit: its rows count twice", log.name()));
@@ -342,7 +331,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   }
   try {
     for (std::string& text : constraint_warnings(posterior, nullptr, log.name(), more.states(), more.view().rows, more.values(),
-                                                 noise_of_values(more))) {
+                                                 more.noise_of_values(more.noise().stddev()))) {
       notes.push_back(std::move(text));
     }
     note_unexpected(posterior, more, log, notes);
@@ -371,7 +360,8 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
   if (n_more > 0) fit.notes.reset();
   if (n_more > 0 && log.file()) fit.logs.push_back(*log.file());
-  if (n_more > 0 && !fit.data_source.ends_with(log.name())) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
+  const bool is_last = (", " + fit.data_source).ends_with(", " + log.name());
+  if (n_more > 0 && !is_last) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
   const double of_more = left_out(all) - before;
   constexpr double much = 1, usual = 3;  // nats; times as much as of as many rows before
   if (of_more > much && of_more > usual * before * n_more / n_before) {

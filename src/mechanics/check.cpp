@@ -13,6 +13,7 @@
 
 #include "base/decompositions.hpp"
 #include "base/parallel.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/differences.hpp"
@@ -49,13 +50,6 @@ LowerRank states_of_lower_rank(const std::vector<int>& ranks) {
     if (ranks[i] < lower.usual) lower.states.push_back(static_cast<int>(i));
   }
   return lower;
-}
-
-LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
-  std::vector<int> ranks;
-  if (mechanics.fault) return {};
-  for (const UdwadiaKalaba& projection : mechanics.projections) ranks.push_back(projection.rank());
-  return states_of_lower_rank(ranks);
 }
 
 LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
@@ -263,9 +257,7 @@ void report_row_sizes(const System& system, const MatrixXd& sizes, int n_zero_ro
           {Level::good, fmt::format("constraint '{}': nothing moves along it, its row of A is zero at every state", label)});
       continue;
     }
-    std::vector<double> sorted(sizes.row(row).begin(), sizes.row(row).end());
-    std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2), sorted.end());
-    const double usual = sorted[sorted.size() / 2];
+    const double usual = median({sizes.row(row).begin(), sizes.row(row).end()});
     Index at = 0;
     const double smallest = sizes.row(row).minCoeff(&at);
     if (smallest > 0 && smallest < 1e-6 * usual) {

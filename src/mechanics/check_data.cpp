@@ -354,19 +354,20 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Re
   VectorXd scale(system.nq());
   for (Index j = 0; j < scale.size(); ++j) scale[j] = std::max(spread(accelerations.row(j)), 1e-300);
   constexpr Index max_states = 50;
-  const Index stride = system.has_conditional_constraints() ? 1 : std::max<Index>(1, states.cols() / max_states);
+  const Index stride = std::max<Index>(1, states.cols() / max_states);
   // of B ddq = Cᵀ b with B = Cᵀ A: what it leaves free, one below the other by the state
   Index rank = 0, lowest_rank = system.nq();
   std::vector<MatrixXd> free;
   in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
     const SystemValues values = system.evaluate(block, parameters);
     for (int i = 0; i < values.n_states(); ++i) {
-      if ((first + i) % stride != 0) continue;
+      const bool is_taken = (first + i) % stride == 0;
+      if (!is_taken && !system.has_conditional_constraints()) continue;
       Eigen::JacobiSVD<MatrixXd> svd(combinations.transpose() * values.A(i) * scale.asDiagonal(), Eigen::ComputeFullV);
       svd.setThreshold(1e-9);
       rank = std::max(rank, svd.rank());
       lowest_rank = std::min(lowest_rank, svd.rank());
-      free.emplace_back(svd.matrixV().rightCols(system.nq() - svd.rank()));
+      if (is_taken) free.emplace_back(svd.matrixV().rightCols(system.nq() - svd.rank()));
     }
   });
   // where the constraints leave no freedom there is nothing to measure

@@ -6,6 +6,7 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
+#include "mechanics/in_blocks.hpp"
 
 namespace gp2 {
 
@@ -118,19 +119,17 @@ Multipliers multipliers_in(std::span<const Expression> expressions, const System
 }
 
 MatrixXd with_known_multipliers(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
-  constexpr Index block = 256;
   MatrixXd out(states.rows() + system.nc(), states.cols());
   out.topRows(states.rows()) = states;
   KnownMultipliers multipliers;
   SystemValues values;
-  for (Index first = 0; first < states.cols(); first += block) {
-    const Index n = std::min(block, states.cols() - first);
-    system.evaluate_into(states.middleCols(first, n), parameters, values);
-    for (int i = 0; i < static_cast<int>(n); ++i) {
+  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
+    system.evaluate_into(block, parameters, values);
+    for (int i = 0; i < values.n_states(); ++i) {
       multipliers.compute(values.M(i), values.A(i), values.b(i), values.F(i));
       out.col(first + i).tail(system.nc()) = multipliers.values();
     }
-  }
+  });
   return out;
 }
 

@@ -63,7 +63,8 @@ class LatentMaker {
     latent.signal_stddev = spec.signal_stddev;
     latent.is_positive = spec.is_positive && !options_.base;  // which it is along directions of its own
     set_features(spec, latent);
-    const std::string& by_default = latent.is_potential ? potential_kernel : options_.kernel;
+    const bool is_along = !options_.base && (!spec.directions.empty() || spec.direction_code);
+    const std::string& by_default = latent.is_potential ? potential_kernel : is_along ? options_.kernel_along : options_.kernel;
     latent.kernel =
         named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? by_default : spec.kernel, latent.feature_names); });
     if (latent.is_potential) require_potential(spec, latent);

@@ -179,7 +179,6 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
   h.upper = Standard::noise_upper * spread;
   if (observations.noise().has_scale()) {
     // the smallest of the stated deviations stays above the lower bound, the usual one below the upper
-    h.unit = fmt::format("stated deviation of {}", name);
     const std::vector<double> scale = observations.measured_scales(k);
     if (!scale.empty()) h.lower /= *std::min_element(scale.begin(), scale.end());
     h.upper = std::max(h.upper / observations.usual_noise(VectorXd::Ones(observations.view().size()))[k], 2 * h.lower);
@@ -189,6 +188,7 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
   constexpr double stated_lower = 0.2, stated_log_stddev = 0.5, stated_correlation = 0.8;
   const bool is_stated = observations.states_noise(k);
   if (is_stated) {
+    h.unit = fmt::format("stated deviation of {}", name);
     h.lower = std::max(h.lower, stated_lower * observations.noise().stddev()[k]);
     h.upper = std::max(h.upper, 2 * h.lower);
   }

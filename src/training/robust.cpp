@@ -35,13 +35,6 @@ Observations with_scale(const Observations& group, MatrixXd scale) {
   return group.with_noise(Noise(group.noise().stddev(), group.noise().is_estimated(), std::move(scale)));
 }
 
-// σ of each value.
-MatrixXd noise_of(const Observations& group, const VectorXd& sigma) {
-  MatrixXd noise(group.values().rows(), group.values().cols());
-  for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = group.noise_at(sigma, i);
-  return noise;
-}
-
 struct Choice {
   std::vector<Observations> observations;  // the distrusted values with a noise of their own
   std::vector<DistrustedValue> distrusted;
@@ -72,7 +65,7 @@ std::vector<LeaveOneOut> left_out_of(const std::vector<Observations>& fitted, co
     const Observations& group = fitted[g];
     const Posterior::Marginal given = posterior.marginal(group.view(), group.states(), /*n_threads=*/0);
     const MatrixXd variance = given.stddev().cwiseAbs2();
-    const MatrixXd noise = noise_of(group, posterior.values().noise_stddev[g]);
+    const MatrixXd noise = group.noise_of_values(posterior.values().noise_stddev[g]);
     const Eigen::ArrayXXd rest = 1 - (variance.array() / noise.array().square()).min(most);
     out.push_back({group.values().array() - (group.values() - given.mean).array() / rest, variance.array() / rest});
   }
@@ -87,7 +80,7 @@ Choice choose(const std::vector<Observations>& observations, const std::vector<O
   Choice choice{observations, {}};
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
-    const MatrixXd noise = noise_of(group, posterior.values().noise_stddev[g]);
+    const MatrixXd noise = group.noise_of_values(posterior.values().noise_stddev[g]);
     MatrixXd scale = scale_of(group);
     const std::size_t n_before = choice.distrusted.size();
     const MatrixXd residual = group.values() - left_out[g].mean;
@@ -207,7 +200,7 @@ class Search {
   }
 
   [[nodiscard]] const Fit& best() const { return *best_; }
-  /// That it was fitted to.
+  /// The observations of this fit.
   [[nodiscard]] const Choice& best_choice() const { return best_choice_; }
   void forget_cost() { lowest_cost_ = std::numeric_limits<double>::infinity(); }
 

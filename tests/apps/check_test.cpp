@@ -196,7 +196,8 @@ TEST(Check, WarnsOfARowThatVanishes) {
 TEST(Check, WithoutSamplingOrDataSaysThatNothingWasEvaluated) {
   const Desk desk;
   desk.write("model.toml", particle(R"([["1", "0"], ["0", "1"]])", R"(["ddq2"])"));
-  EXPECT_THAT(desk.done("gp2 check model.toml").out, HasSubstr("no --data, and neither [sampling] nor [motion]"));
+  EXPECT_THAT(desk.done("gp2 check model.toml").out,
+              HasSubstr("no --data, and the model has no [truth] with [sampling] or [motion]"));
 }
 
 }  // namespace

@@ -79,9 +79,9 @@ TEST(DeriveCommand, WritesNothingWhereTheLogIsBad) {
   fails(log.substr(0, log.find('\n', 40) + 1), "",
         "1 samples are too few to find a motion in; 5 are needed; leave that episode out");
   fails(replaced(log, "time,", "clock,"), "", "missing column 't'");
-  fails(log, "--episode run", "episode column: log.csv has no column 'run'");
+  fails(log, "--episode run", "--episode: log.csv has no column 'run'");
   fails(log, "--episodes 5-3", "--episodes: '5-3' is not a range FIRST-LAST");
-  fails(log, "--episodes 7", "episodes: log.csv has no episode '7'; it has: 0, 1");
+  fails(log, "--episodes 7", "--episodes: log.csv has no episode '7'; it has: 0, 1");
   fails(log, "--smoothness 3/2", "--smoothness");
   fails(replaced(log, "theta2", "phi"), "", "phi");
 }
@@ -149,7 +149,7 @@ TEST_F(FitRaw, RefusesWhatDoesNotGoTogether) {
   EXPECT_THAT(refusal("--raw log.csv --data log.csv"), HasSubstr("--raw replaces --data: leave out one of them"));
   EXPECT_THAT(refusal("--data log.csv --passes 2"), HasSubstr("--raw"));
   EXPECT_THAT(refusal("--raw log.csv --smoothed log.csv"), HasSubstr("log.csv"));
-  EXPECT_THAT(refusal("--raw log.csv --passes -1"), HasSubstr("passes: must not be negative, got -1"));
+  EXPECT_THAT(refusal("--raw log.csv --passes -1"), HasSubstr("--passes: must not be negative, got -1"));
   EXPECT_THAT(refusal("--raw absent.csv"), HasSubstr("absent.csv"));
 }
 

@@ -401,11 +401,11 @@ TEST(FitFile, RefusesToWriteOptionsThatAreNoObject) {
 }
 
 class OldFit : public testing::TestWithParam<int> {};
-INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7, 8, 9, 10));
+INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7, 8, 9, 10, 12));
 
 // written by gp2 when that format was its newest: alone; with a log of another system; with a noise per value; of a robot;
 // without draws; without sums over states; without inducing points; of rows where sums over them stand now; with a
-// discrepancy in every direction, without the logs
+// discrepancy in every direction, without the logs; of one kernel for all latents
 TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   const auto path = std::filesystem::path(GP2_SOURCE_DIR) / "tests/files/old_fits" / fmt::format("version_{}.json", GetParam());
   ASSERT_EQ(Json::parse(read_file(path)).at("version"), GetParam());

@@ -570,19 +570,19 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
       fault(cart_log([](auto&) {}, {"t", "angle"})),
       HasSubstr(
           "log.csv: no column is a coordinate of 'cart' (q1); the file has: t, angle. Rename them, or give `map=LOGNAME=q1`"));
-  EXPECT_THAT(fault(cart_log(), {.episode_column = "run"}),
-              HasSubstr("episode column: log.csv has no column 'run'; it has: t, q1"));
-  EXPECT_THAT(fault(cart_log(), {.episodes = {"3"}}), HasSubstr("episodes: log.csv has no column 'episode' to choose from"));
+  EXPECT_THAT(fault(cart_log(), {.episode_column = "run"}), HasSubstr("`episode`: log.csv has no column 'run'; it has: t, q1"));
+  EXPECT_THAT(fault(cart_log(), {.episodes = {"3"}}), HasSubstr("`episodes`: log.csv has no column 'episode' to choose from"));
   EXPECT_THAT(fault(short_log().table, {.episodes = {"7"}}, pendulum()),
-              HasSubstr("episodes: simulated log has no episode '7'; it has: 0, 1"));
-  EXPECT_THAT(fault(cart_log(), {.keep = {"heat"}}), HasSubstr("keep: log.csv has no column 'heat'; it has: t, q1"));
-  EXPECT_THAT(fault(cart_log(), {.keep = {"q1"}, .rate = 10}), HasSubstr("keep: rows of an even rate are not those of the log"));
-  EXPECT_THAT(fault(cart_log(), {.rate = -1}), HasSubstr("rate: must be positive, got -1"));
+              HasSubstr("`episodes`: simulated log has no episode '7'; it has: 0, 1"));
+  EXPECT_THAT(fault(cart_log(), {.keep = {"heat"}}), HasSubstr("`keep`: log.csv has no column 'heat'; it has: t, q1"));
+  EXPECT_THAT(fault(cart_log(), {.keep = {"q1"}, .rate = 10}),
+              HasSubstr("`keep` copies rows of the log, and those of an even `rate` are others"));
+  EXPECT_THAT(fault(cart_log(), {.rate = -1}), HasSubstr("`rate`: must not be negative, got -1"));
   EXPECT_THAT(fault(cart_log(), {.rate = 1e9}), HasSubstr("rows; at most 1e+07 are written"));
   EXPECT_THAT(fault(short_log().table, {.like = cart_log([](auto&) {}, {"t", "q3"})}, pendulum()),
               HasSubstr("like: log.csv has no column q6, which simulated log has"));
-  EXPECT_THAT(fault(cart_log(), {.every = 0}), HasSubstr("every: must be at least 1, got 0"));
-  EXPECT_THAT(fault(cart_log(), {.outlier_threshold = -1}), HasSubstr("outlier threshold: must not be negative, got -1"));
+  EXPECT_THAT(fault(cart_log(), {.every = 0}), HasSubstr("`every`: must be at least 1, got 0"));
+  EXPECT_THAT(fault(cart_log(), {.outlier_threshold = -1}), HasSubstr("`outlier_threshold`: must not be negative, got -1"));
   EXPECT_THAT(fault(cart_log(
                   [](auto& rows) {
                     for (Row& row : rows) row.push_back("");

@@ -281,6 +281,7 @@ TEST(FitNotes, TellWhereStretchesArePredictedWorseThanRows) {
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8), told) << "too sure of itself";
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8, 50), testing::IsEmpty()) << "too few rows for a coverage";
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.95), testing::IsEmpty());
+  EXPECT_THAT(note_of(scores_of(0.0068, 0.0058, 0.043, 0.995, 267)), testing::IsEmpty()) << "sound: the bands hold";
   EXPECT_THAT(note_of_stretches(0.08, 0.085, 0.95), testing::IsEmpty()) << "rows are no better";
 }
 

@@ -44,7 +44,7 @@ def test_show_is_what_the_command_prints(command, options):
 def test_check_without_data_or_sampling_says_so():
     system = gp2.System(coordinates=["x"], mass=[["1"]], noise=1)
     assert findings(gp2.check(system))[1:] == [
-        ("warning", "no data, and neither [sampling] nor [motion] in the model: there are no states to check")
+        ("warning", "no data, and the model has no [truth] with [sampling] or [motion]: there are no states to check")
     ]
 
 

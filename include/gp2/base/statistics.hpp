@@ -24,4 +24,7 @@ inline constexpr double median_of_normal = 0.6744897501960817;
 /// The median of at least one value; of an even number the larger one of the two in the middle.
 double median(std::vector<double> values);
 
+/// Median of the differences of successive times that are positive; 0 where none is.
+double usual_step(const Eigen::Ref<const Eigen::VectorXd>& times);
+
 }  // namespace gp2

@@ -45,6 +45,8 @@ class LogReader {
 
   [[nodiscard]] const CsvTable& table() const { return table_; }
   [[nodiscard]] bool has(const std::string& name) const { return find(name) >= 0; }
+  /// Whether there is such a column with something in it.
+  [[nodiscard]] bool measures(const std::string& name) const;
   /// Where a name of the model stands in the table; it counts as used then. −1 when it is not there.
   [[nodiscard]] int column(const std::string& name) { return has(name) ? require(name) : -1; }
   /// Where the log says what belongs together; −1 where it does not.

@@ -31,14 +31,15 @@ struct FitFile {
   ///   hyperparameters of another posterior.
   FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
 
-  /// 12: a discrepancy that grows outside the data; 11: a discrepancy that the constraint admits, centres of features, the logs; 10:
-  /// what many observations say, in their place; 9: inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a checksum
-  /// and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2:
-  /// observations of other systems. All of them are read; 12 is written.
-  static constexpr int format_version = 12;
+  /// 13: a kernel of latents along directions; 12: a discrepancy that grows outside the data; 11: a discrepancy that the constraint
+  /// admits, centres of features, the logs; 10: what many observations say, in their place; 9: inducing points; 8: sums over
+  /// states; 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise
+  /// of their own; 3: mechanics that are code; 2: observations of other systems. All of them are read; 13 is written.
+  static constexpr int format_version = 13;
 
   Model model;
   FitPriorOptions prior_options;
+  std::string library;        // version that wrote the file; empty: it is not from one
   std::string data_source;    // where the data came from, for people
   std::vector<LogFile> logs;  // that it was learned from, as far as they are files
   std::vector<Observations> observations;

@@ -73,6 +73,9 @@ struct FitJob {
   std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less
 };
 
+/// @throws InputError naming an option that is out of its range.
+void require_in_range(const FitRequest& request);
+
 /// @throws InputError where `commands` are given while no input of any model acts late: what acts at a row then depends on no
 /// commands before, and they tell nothing more.
 void require_use_of_commands(const FitRequest& request);

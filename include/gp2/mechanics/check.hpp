@@ -51,7 +51,6 @@ struct LowerRank {
 std::vector<int> ranks_of(const System& system, const MechanicsBatch& mechanics);
 /// @param ranks  at each state
 LowerRank states_of_lower_rank(const std::vector<int>& ranks);
-LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
 /// The same of any number of states, in the memory of a few.
 LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                const Eigen::Ref<const Eigen::VectorXd>& parameters);

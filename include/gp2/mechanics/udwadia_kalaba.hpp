@@ -76,9 +76,8 @@ class UdwadiaKalaba {
   /// When it is not, nothing below is valid.
   [[nodiscard]] bool motion_is_determined() const { return mass_is_positive_definite() || mass_is_singular(); }
 
-  [[nodiscard]] const Eigen::MatrixXd& mass() const { return mass_; }  // M' or, where M is positive definite, M  (nq × nq)
-  [[nodiscard]] const Eigen::VectorXd& row_masses() const { return row_mass_; }  // σ; zeros where M is positive definite  (nc)
-  [[nodiscard]] int rank() const { return rank_; }                               // of A
+  [[nodiscard]] const Eigen::MatrixXd& mass() const { return mass_; }    // M' or, where M is positive definite, M  (nq × nq)
+  [[nodiscard]] int rank() const { return rank_; }                       // of A
   [[nodiscard]] int n_zero_rows() const { return n_zero_rows_; }         // rows of A that vanish at this state; they are dropped
   [[nodiscard]] double inconsistency() const { return inconsistency_; }  // largest |A L b − b|, rows of B of unit norm
   [[nodiscard]] double size_of_b() const { return size_of_b_; }          // largest |b|, rows of B of unit norm

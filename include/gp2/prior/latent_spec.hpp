@@ -39,7 +39,7 @@ struct StateCode {
 /// What a latent is made from: words, as in the [[latent]] of a model file (docs/model-files.md), or code.
 struct LatentSpec {
   std::string name;
-  std::string kernel = {};            // empty: PriorOptions::kernel; of a potential rq + linear
+  std::string kernel = {};            // empty: PriorOptions::kernel or kernel_along; of a potential rq + linear
   std::vector<std::string> features;  // φ(x): expressions of the state; of code, what its numbers are called
   StateCode feature_code = {};        // empty: features are expressions
   Latent::Base base = Latent::Base::acceleration;
@@ -76,6 +76,9 @@ struct PriorOptions {
   /// Of a latent that gives no kernel: what machines are made of, a part that is linear in the features and a smooth one; the p
   /// directions of such a latent have hyperparameters of their own.
   std::string kernel = "se + linear";
+  /// Of one along directions of its own, as friction at a joint is: it may have kinks, and no discrepancy stands for what the
+  /// smooth part rules out.
+  std::string kernel_along = "se + matern32 + linear";
   bool per_direction = true;
   /// By a feature's name, what such a latent subtracts from it: its mean over the data, so that the linear part does not depend on
   /// where a coordinate has its zero. Features that are not named stay as they are.
