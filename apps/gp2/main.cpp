@@ -6,6 +6,7 @@
 #include <sstream>
 #include <string>
 #include <utility>
+#include <variant>
 #include <vector>
 
 #ifdef __GLIBC__
@@ -95,6 +96,26 @@ std::string known_command(const std::vector<gp2::command::Command>& commands, in
   throw gp2::command::UsageError{fmt::format("there is no command '{}'{}", argv[1], mend)};
 }
 
+// CLI11 takes the next option for a value that is missing.
+void require_values(const gp2::command::Command& command, int argc, char** argv) {
+  std::vector<std::string> all = {"-h", "--help"}, with_value;
+  for (const gp2::Option& option : command.options) {
+    const bool takes_value =
+        !std::holds_alternative<bool*>(option.value) && !std::holds_alternative<gp2::YesByDefault>(option.value);
+    std::istringstream flags(gp2::command::flag_of(option));  // -o,--output
+    for (std::string flag; std::getline(flags, flag, ',');) {
+      if (!flag.starts_with('-')) continue;  // an argument by its position
+      all.push_back(flag);
+      if (takes_value) with_value.push_back(flag);
+    }
+  }
+  for (int i = 2; i + 1 < argc; ++i) {
+    const std::string next = argv[i + 1];
+    if (std::ranges::count(with_value, argv[i]) == 0 || std::ranges::count(all, next.substr(0, next.find('='))) == 0) continue;
+    throw gp2::command::UsageError{fmt::format("{}: its value is missing", argv[i])};
+  }
+}
+
 // command: the one that is to run, or ""
 int usage_error(const std::string& text, const std::string& command) {
   return failed(exit_bad_input, fmt::format("error: {}\nRun gp2{} --help.", text, command.empty() ? "" : " " + command));
@@ -147,6 +168,8 @@ int main(int argc, char** argv) {
   std::string running;
   try {
     running = known_command(commands, argc, argv);
+    const auto command = std::ranges::find(commands, running, &gp2::command::Command::name);
+    if (command != commands.end()) require_values(*command, argc, argv);
     if (argc > 1 && running != "fit" && gp2::command::n_started_together() > 1) {
       throw gp2::InputError("mpirun is for gp2 fit; start this command alone");
     }

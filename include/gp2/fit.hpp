@@ -94,7 +94,8 @@ struct LaplaceUncertainty {
 /// Draws of the hyperparameters given the data, by Hamiltonian Monte Carlo about the optima that the restarts found (theory.md,
 /// T31). Parameters that A or b depends on are held at the optimum, so that means and samples of the mixture obey one constraint.
 struct HyperparameterDraws {
-  static constexpr double largest_r_hat = 1.1;  // beyond, chains do not agree
+  /// Beyond, chains disagree so far that predictions may depend on the seed (docs/priors.md).
+  static constexpr double largest_r_hat = 2;
 
   Eigen::MatrixXd values;  // physical units, the likeliest first (n × draws)
   // over all steps of the chains, of which `values` are some: each (n), in the units of the hyperparameters

@@ -28,18 +28,22 @@ std::string signatures_in(const std::string& text) {
   return text.substr(first, end - first);
 }
 
+// What was called, by what pybind says of it: of a constructor the class.
+std::string called(const std::string& text, const std::string& signatures) {
+  const py::object of_class = py::module_::import("re").attr("search")(R"(1\. [\w.]*\.(\w+)\()", signatures);
+  return of_class.is_none() ? text.substr(0, text.find('(')) : of_class.attr("group")(1).cast<std::string>();
+}
+
 // A keyword that no signature has. One that ends in **kwargs has others too: there a keyword that is near a parameter is taken for it.
 void refuse_unknown_keyword(const std::string& text, const std::string& signatures, const py::dict& keywords) {
   const bool has_others = signatures.find("**") != std::string::npos;
   const py::module_ re = py::module_::import("re");
   const py::list known = re.attr("findall")(R"((\w+): )", signatures);
-  const py::object of_class = re.attr("search")(R"(1\. [\w.]*\.(\w+)\()", signatures);
-  const std::string name = of_class.is_none() ? text.substr(0, text.find('(')) : of_class.attr("group")(1).cast<std::string>();
   for (const auto& [keyword, value] : keywords) {
     if (known.contains(keyword)) continue;
     const auto given = keyword.cast<std::string>();
     if (has_others && (gp2::python::is_keyword(given) || gp2::python::nearest(given, known).empty())) continue;
-    gp2::python::refuse_keyword(name, given, known);
+    gp2::python::refuse_keyword(called(text, signatures), given, known);
   }
 }
 
@@ -99,6 +103,24 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
   if (!negative.empty()) throw py::type_error(negative);
 }
 
+// An argument without a default that is not given, where there is one signature.
+void refuse_missing_argument(const std::string& text, const std::string& signatures, const py::tuple& arguments,
+                             const py::dict& keywords) {
+  if (signatures.find(" 2. ") != std::string::npos) return;
+  const std::size_t first = signatures.find('(') + 1, end = std::min(signatures.rfind(") ->"), signatures.rfind(')'));
+  if (first == 0 || end == std::string::npos || end <= first) return;
+  std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
+  const py::object split = py::module_::import("re").attr("split")(R"(, (?=\w+: |\*))", signatures.substr(first, end - first));
+  for (const py::handle part : split) {
+    const auto parameter = part.cast<std::string>();
+    if (parameter.starts_with('*')) return;
+    const std::string name = parameter.substr(0, parameter.find(':'));
+    const bool is_optional = parameter.find(" = ") != std::string::npos;
+    if (position++ < arguments.size() || is_optional || keywords.contains(name)) continue;
+    throw py::type_error(fmt::format("{}() is missing the argument '{}'", called(text, signatures), name));
+  }
+}
+
 PyObject* dispatch_or_say_why(PyObject* self, PyObject* arguments, PyObject* keywords) {
   PyObject* const result = dispatch(self, arguments, keywords);
   if (result != nullptr || PyErr_ExceptionMatches(PyExc_TypeError) == 0) return result;
@@ -109,6 +131,7 @@ PyObject* dispatch_or_say_why(PyObject* self, PyObject* arguments, PyObject* key
     if (!signatures.empty()) {
       refuse_unknown_keyword(text, signatures, given);
       refuse_wrong_type(text, signatures, py::reinterpret_borrow<py::tuple>(arguments), given);
+      refuse_missing_argument(text, signatures, py::reinterpret_borrow<py::tuple>(arguments), given);
     }
     error.restore();
   } catch (const py::builtin_exception& refusal) {

@@ -651,6 +651,9 @@ std::vector<std::string> export_posterior(const PyPosterior& self, const py::obj
     files.emplace_back(to / name, text);
     written.push_back((to / name).string());
   }
+  std::error_code error;
+  std::filesystem::create_directories(to, error);
+  if (error) throw InputError(fmt::format("folder {}: the folder cannot be made: {}", to.string(), error.message()));
   write_files(files);
   return written;
 }

@@ -203,6 +203,15 @@ class Deriver {
     for (const Task& task : tasks_) {
       const std::optional<Jump> jump = jump_of(task.channel.measurements);
       if (!jump) continue;
+      constexpr double turn = 2 * std::numbers::pi, about = 0.05;
+      const bool is_angle = system_.coordinates()[static_cast<std::size_t>(task.coordinate)].angle;
+      if (!is_angle && std::abs(std::abs(jump->by) / turn - 1) < about) {
+        data_.notes.push_back(fmt::format(
+            "warning: {}: {} jumps by {:.3g} at t = {:.6g}, about a whole turn: if it is an angle that wraps, write angle = true "
+            "in the model",
+            log_.name(), name_of(task.coordinate), jump->by, episode_of(task.episode).start + jump->time));
+        continue;
+      }
       constexpr int many = 20;
       data_.notes.push_back(
           fmt::format("warning: {}: {} jumps by {:.3g} at t = {:.6g} and stays there{}", log_.name(), name_of(task.coordinate),
@@ -804,10 +813,28 @@ class Deriver {
       if (conditioned) {
         hold_constraints(states, tasks, i, i - first, state);
       } else {
-        states.complete(state, data_.accelerations.col(i));
+        complete(states, i, state);
       }
       data_.states.col(i) = state;
       from = state.head(2 * layout.nq);
+    }
+  }
+
+  /// @throws NumericalError naming the log and what to log, where the constraints do not give what was not measured.
+  void complete(const ConstrainedStates& states, Index row, VectorXd& state) {
+    try {
+      states.complete(state, data_.accelerations.col(row));
+    } catch (const NumericalError& error) {
+      const auto names_of = [&](const std::vector<int>& coordinates) {
+        std::vector<std::string> names;
+        for (const int j : coordinates) names.push_back(name_of(j));
+        return fmt::format("{}", fmt::join(names, ", "));
+      };
+      const std::string unknown = names_of(data_.completed);
+      throw NumericalError(fmt::format(
+          "{}: near t = {:.6g} the constraints do not determine {} from {}: a dead centre, or positions that no posture has "
+          "({}). Log {} too, or another coordinate",
+          log_.name(), data_.states(system_.layout().t(), row), unknown, names_of(data_.measured), error.what(), unknown));
     }
   }
 

@@ -288,11 +288,14 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
   const Evaluation::Part& rows = cross_validation.one_by_one;
   const double noise = cross_validation.nrmse_of_noise;
   if (const LittlePredicted little = little_predicted(cross_validation); little.part != nullptr) {
-    const bool is_worse_than_mean = little.part->nrmse >= 1;
-    const bool is_warning = is_worse_than_mean || denies_model(cross_validation, little.part->nrmse);
-    notes.push_back(fmt::format(
-        "{}the fit predicts {} badly{}: nrmse {:.2g}, of which noise is {:.2g}. {}", is_warning ? "warning: " : "", little.what,
-        is_worse_than_mean ? ", worse than their mean would" : "", little.part->nrmse, noise, causes_text(prior)));
+    constexpr double useless = 0.9;
+    const double error = little.part->nrmse;
+    const bool is_warning = error >= useless || denies_model(cross_validation, error);
+    const char* const than_mean = error >= 1         ? ", worse than their mean would"
+                                  : error >= useless ? ", hardly better than their mean would"
+                                                     : "";
+    notes.push_back(fmt::format("{}the fit predicts {} badly{}: nrmse {:.2g}, of which noise is {:.2g}. {}",
+                                is_warning ? "warning: " : "", little.what, than_mean, error, noise, causes_text(prior)));
   } else if (predicts_stretches_worse(cross_validation)) {
     const Evaluation::Part& stretches = *cross_validation.stretches;
     notes.push_back(fmt::format(

@@ -13,6 +13,7 @@
 #include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "inference/cross_validation.hpp"
 #include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 
@@ -387,6 +388,9 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
                                            parameters_of(at.view, posterior.values().parameters));
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
+  if (log.file() && fit.has_learned(*log.file())) {
+    out.notes.push_back(fmt::format("{}: the fit has learned from this log: errors at new data are larger", name));
+  }
   log = CsvTable();
   EvaluationOptions options{at.view.other_system, {}, request.threads, stop};
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
@@ -395,6 +399,12 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
   for (std::string& text : constraint_warnings(posterior, at.view.other_system, name, states.states, rows, states.accelerations,
                                                options.noise_stddev)) {
     out.notes.push_back(std::move(text));
+  }
+  if (const Evaluation& e = out.evaluation; is_coverage_low(e.coverage95, e.n)) {
+    out.notes.push_back(fmt::format(
+        "warning: {}: {:.0f} % of the values lie within their 95 % intervals: they are noisier than the data of the fit, "
+        "the log goes where these were not, or the model lacks something; gp2 report shows where",
+        name, 100 * e.coverage95));
   }
   return out;
 }

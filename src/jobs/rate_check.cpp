@@ -1,6 +1,7 @@
 #include "jobs/rate_check.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <functional>
 #include <iterator>
@@ -167,12 +168,24 @@ bool is_scaled(const Steps& steps) {
   return std::abs(s - 1) > std::max(least, by_chance) + 2 * (of_noise + of_trapezoids);
 }
 
-const char* cause_of_factor(double factor) {
-  constexpr double degrees = 180 / std::numbers::pi, near = 0.1;
-  const auto is_near = [&](double one) { return std::abs(factor / one - 1) < near; };
-  if (is_near(-1)) return "a wrong sign";
-  if (is_near(degrees) || is_near(1 / degrees)) return "degrees instead of radians";
-  return "a unit or a sign, or the clock";
+const char* cause_of_factor(double factor, bool is_angle) {
+  struct Cause {
+    double factor;
+    const char* text;
+  };
+  constexpr double degrees = 180 / std::numbers::pi;
+  const char* const of_degrees = is_angle ? "degrees instead of radians" : "degrees instead of radians, if it is an angle";
+  const std::array<Cause, 6> causes = {{{degrees, of_degrees},
+                                        {1 / degrees, of_degrees},
+                                        {60, "t in minutes instead of seconds"},
+                                        {1 / 60.0, "a rate per minute instead of per second"},
+                                        {3600, "t in hours instead of seconds"},
+                                        {1 / 3600.0, "a rate per hour instead of per second"}}};
+  if (std::abs(factor + 1) < 0.1) return "a wrong sign";
+  // degrees and minutes are a twentieth apart
+  const auto distance = [&](const Cause& cause) { return std::abs(factor / cause.factor - 1); };
+  const Cause& nearest = *std::ranges::min_element(causes, {}, distance);
+  return distance(nearest) < 0.03 ? nearest.text : "a unit or a sign, or the clock";
 }
 
 // By how much a rate is too large throughout: y = x − o h. Nothing where that does not make it the right one, does not stand out of its
@@ -253,7 +266,8 @@ std::string better_rate(const RateColumns& columns) {
     const double tau = static_cast<double>(*lag) * rows.usual_length() + lateness(steps, 0.75 * rows.usual_length()).value_or(0);
     std::vector<std::string> texts;
     if (is_scaled(steps))
-      texts.push_back(fmt::format("the rate is {:.3g} × the column: {}", steps.slope(), cause_of_factor(steps.slope())));
+      texts.push_back(
+          fmt::format("the rate is {:.3g} × the column: {}", steps.slope(), cause_of_factor(steps.slope(), columns.is_angle)));
     if (tau != 0) {
       texts.push_back(fmt::format("the column {} by {:.2g} s, {:.2g} of the log's steps, or {} {}", tau > 0 ? "lags" : "leads",
                                   std::abs(tau), std::abs(tau) / rows.usual_length(), columns.name, tau > 0 ? "leads" : "lags"));

@@ -284,6 +284,23 @@ std::vector<StateSensitivity> sensitivities_of(const Posterior& posterior, const
   return out;
 }
 
+// The inputs that the prior reads must be in the raw log: the smoothed one has other columns to tell of.
+void require_inputs(const FitRequest& request, const CsvTable& log) {
+  if (request.problem.baseline) return;  // whose prior is another
+  const System& system = *request.model.system;
+  FitPriorOptions options;
+  options.mean = request.problem.mean;
+  const bool paper = request.problem.protocol.name == Protocol::Name::paper;
+  options.base = paper ? std::optional(Latent::Base::acceleration) : request.problem.base;
+  const std::vector<bool> reads = make_prior(request.model, options).reads();
+  LogReader reader = open_log(request.model, log, request.problem.columns);
+  for (std::size_t k = 0; k < system.inputs().size(); ++k) {
+    const std::string& input = system.inputs()[k];
+    const bool is_read = reads[static_cast<std::size_t>(system.layout().u(static_cast<int>(k)))];
+    if (is_read && !reader.has(input)) static_cast<void>(reader.values({input}));  // throws, and says what there is
+  }
+}
+
 double total_gain(const DerivedData& data) {
   double gain = 0;
   for (const DerivedSeries& one : data.series) gain += one.gain;
@@ -328,6 +345,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
                             const std::atomic<bool>* stop) {
   require_in_range(request);
   if (options.most_passes < 0) throw InputError(fmt::format("`passes`: must not be negative, got {}", options.most_passes));
+  require_inputs(request, log);
   const System& system = *request.model.system;
   DeriveOptions smoothing = options.derive;
   smoothing.columns = request.problem.columns;

@@ -531,6 +531,9 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   report.relevance = relevance_of(posterior);
   report.learned = learned_forces(posterior);
   if (request.data) report.data.push_back(compare(report.fit, posterior, request, notes));
+  if (request.data && request.data->file() && report.fit.has_learned(*request.data->file())) {
+    notes.push_back(fmt::format("{}: the fit has learned from this log: errors at new data are larger", request.data->name()));
+  }
   if (request.truth) add_truth(request, report);
   if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {
     MatrixXd q(system->layout().size(), 0);

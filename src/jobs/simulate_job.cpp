@@ -9,6 +9,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -163,7 +164,7 @@ VectorXd start_state(const Model& model, const VectorXd& parameters, const Simul
 
 // Inputs must cover the motion: they are not extrapolated.
 InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuators, const SimulateRequest& request,
-                         const std::map<std::string, std::string>& columns) {
+                         const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
   if (!request.inputs) return {};
   const System& system = *model.system;
   const CsvTable& table = *request.inputs;
@@ -189,6 +190,10 @@ InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuat
       throw InputError(
           fmt::format("times {} to {} do not cover the motion from {} to {}", times[0], times[times.size() - 1], t_start, t_end));
     }
+    if (const double step = usual_step(times); step > t_end - t_start && times.size() > 2) {
+      notes.push_back(fmt::format("warning: {}: its rows are {:.3g} s apart and the motion lasts {:.3g} s: is its t in s?",
+                                  table.name(), step, t_end - t_start));
+    }
     return signal;
   } catch (const InputError& error) {
     throw InputError(fmt::format("{}: {}", table.name(), error.what()));
@@ -210,7 +215,7 @@ SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, 
   job.options.absolute_tolerance = request.absolute_tolerance;
   job.options.max_steps = request.max_steps;
   job.options.project = request.project;
-  job.options.inputs = input_signal(model, actuators, request, columns);
+  job.options.inputs = input_signal(model, actuators, request, columns, job.notes);
   job.start = start_state(model, parameters, request, columns, job.notes);
   return job;
 }

@@ -164,19 +164,29 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
   }
   Nearest found;
   std::string why;
+  const auto warn_of_nearest = [&](const std::string& moves) {
+    notes.push_back(
+        fmt::format("warning: `start`: what is given leaves no solution of the constraints ({}); the nearest that has one is {}",
+                    why, moves));
+  };
   try {
     found = solve_start(system, parameters, start, why);
   } catch (const NumericalError& error) {
     if (why.empty()) why = error.what();
-    notes.push_back(fmt::format("warning: `start`: what is given leaves no solution of the constraints ({})", why));
+    try {
+      // simulate() moves all coordinates together, which may lead to the constraints from here too
+      const Eigen::VectorXd projected = project_onto_constraints(system, parameters, start.state);
+      std::erase_if(open, [&](int k) { return projected[k] == before[k]; });
+      std::vector<std::string> moves = {listed_moves(names, start, projected), listed(names, projected, open, before)};
+      std::erase_if(moves, [](const std::string& one) { return one.empty(); });
+      warn_of_nearest(fmt::format("{}", fmt::join(moves, ", ")));
+    } catch (const NumericalError&) {
+      notes.push_back(fmt::format("warning: `start`: what is given leaves no solution of the constraints ({})", why));
+    }
     return start.state;
   }
   const std::string moves = listed_moves(names, start, found.projected);
-  if (!moves.empty() && (!is_whole || is_beyond_rounding(system, start.state, found.projected))) {
-    notes.push_back(
-        fmt::format("warning: `start`: what is given leaves no solution of the constraints ({}); the nearest that has one is {}",
-                    why, moves));
-  }
+  if (!moves.empty() && (!is_whole || is_beyond_rounding(system, start.state, found.projected))) warn_of_nearest(moves);
   std::vector<int> solved;
   std::ranges::copy_if(open, std::back_inserter(solved), [&](int k) { return found.projected[k] != start.state[k]; });
   if (solved.empty()) return found.start;

@@ -130,8 +130,11 @@ bool draws_know_parameters(const FitReport& report) {
 // Under delays and lags that are known.
 double stddev_under_actuators(const FitReport& report, std::size_t k) {
   const auto at = static_cast<Index>(k);
-  if (draws_know_parameters(report) && report.draws->is_drawn(at)) return report.draws->stddev[at];
-  return !report.uncertainty || report.hyperparameters[k].at_bound() ? not_a_number : report.uncertainty->stddev[at];
+  if (report.hyperparameters[k].at_bound()) return not_a_number;
+  const double by_curvature = report.uncertainty ? report.uncertainty->stddev[at] : not_a_number;
+  // draws of what the data leave open tell the width of its bounds, or how far a chain got
+  const bool is_of_draws = draws_know_parameters(report) && report.draws->is_drawn(at) && !std::isinf(by_curvature);
+  return is_of_draws ? report.draws->stddev[at] : by_curvature;
 }
 
 // What the errors of delays and lags add to the covariance of two parameters.
@@ -156,16 +159,16 @@ double stddev_of_parameter(const FitReport& report, std::size_t k) {
 ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k) {
   const auto at = static_cast<Index>(k);
   const double stddev = stddev_of_parameter(report, k);
-  if (!draws_know_parameters(report) || !report.draws->is_drawn(at)) return {.stddev = stddev};
+  if (!draws_know_parameters(report) || !report.draws->is_drawn(at) || !std::isfinite(stddev)) return {.stddev = stddev};
   const HyperparameterDraws& draws = *report.draws;
-  const double mean = draws.mean[at], wider = stddev / draws.stddev[at];
-  return {true, stddev, mean, mean + wider * (draws.lower[at] - mean), mean + wider * (draws.upper[at] - mean)};
+  const double mean = draws.mean[at], factor = stddev / draws.stddev[at];
+  return {true, stddev, mean, mean + factor * (draws.lower[at] - mean), mean + factor * (draws.upper[at] - mean)};
 }
 
 double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l) {
   const auto a = static_cast<Index>(k), b = static_cast<Index>(l);
   const bool is_of_draws = draws_know_parameters(report);
-  if (!is_of_draws && !report.uncertainty) return not_a_number;
+  if (!std::isfinite(stddev_under_actuators(report, k)) || !std::isfinite(stddev_under_actuators(report, l))) return not_a_number;
   const double correlation = is_of_draws ? report.draws->correlation(a, b) : report.uncertainty->correlation(a, b);
   const double added = covariance_by_actuators(report, k, l);
   if (added == 0) return correlation;

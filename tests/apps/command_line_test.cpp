@@ -221,7 +221,9 @@ TEST(CommandLine, TalkGoesToStderrAndResultsToStdout) {
   const Outcome predicted = desk.done("gp2 predict fit.json --states train.csv -o prediction.csv");
   EXPECT_EQ(predicted.out, "");
   EXPECT_THAT(predicted.err, HasSubstr("prediction.csv: 20 predictions"));
-  EXPECT_THAT(desk.done("gp2 evaluate fit.json --data train.csv").out, HasSubstr("max |A ddq - b|"));
+  const Outcome of_training = desk.done("gp2 evaluate fit.json --data log.csv");
+  EXPECT_THAT(of_training.out, HasSubstr("max |A ddq - b|"));
+  EXPECT_THAT(of_training.err, HasSubstr("log.csv: the fit has learned from this log"));
 }
 
 TEST(CommandLine, QuietKeepsWarningsAndDropsNotesAndProgress) {

@@ -204,6 +204,10 @@ TEST(SimulateModelCommand, FollowsTheInputsOfATable) {
   EXPECT_EQ(number(motion, 4, "u2"), 0.01);
   EXPECT_GT(number(motion, 8, "q1"), 1);
   EXPECT_GT(number(motion, 8, "q3"), 0.01);
+  desk.write("milliseconds.csv", "t,u1,u2\n0,1,0\n1000,1,0\n2000,0,0.01\n5000,0,0\n");
+  const Outcome late =
+      desk.done("gp2 simulate models/unicycle.toml --start q3=0 --inputs milliseconds.csv --t-end 4 -o motion.csv");
+  EXPECT_THAT(late.err, HasSubstr("its rows are 1e+03 s apart and the motion lasts 4 s: is its t in s?"));
 }
 
 TEST_F(SimulateFit, StaysOnTheConstraintAndWritesItsUncertainty) {

@@ -129,6 +129,53 @@ TEST(Derive, APositionThatJumpsAndStaysIsSaid) {
   for (const auto& edit : sound) EXPECT_THAT(notes_of(edit), testing::Not(Contains(HasSubstr("jumps by"))));
 }
 
+TEST(Derive, AnAngleThatWrapsAndIsNotSaidToBeOneIsNamed) {
+  const auto notes_of = [](double by) {
+    return derive(cart(), cart_log([&](std::vector<Row>& rows) {
+                    for (std::size_t k = 120; k < rows.size(); ++k) rows[k][1] = shortest(std::stod(rows[k][1]) + by);
+                  }))
+        .notes;
+  };
+  const auto wraps = Contains(HasSubstr("about a whole turn: if it is an angle that wraps, write angle = true in the model"));
+  EXPECT_THAT(notes_of(2 * std::numbers::pi), wraps);
+  EXPECT_THAT(notes_of(-2 * std::numbers::pi), wraps);
+  EXPECT_THAT(notes_of(3), Not(wraps));
+}
+
+// Where a slide turns round, two postures of its crank meet.
+TEST(Derive, AtADeadCentreSaysWhatToLog) {
+  const Model crank = Model::parse(R"toml(
+name = "crank"
+coordinates = [{ name = "phi", angle = true }, "x"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+force = ["0", "0"]
+[constraints]
+position = ["x - cos(phi)"]
+[sampling]
+start = { phi = 1.0, x = 0.5 }
+[[latent]]
+name = "rest"
+kernel = "se"
+features = ["dphi"]
+directions = "force"
+)toml",
+                                   "crank.toml");
+  const CsvTable log = cart_log(
+      [](std::vector<Row>& rows) {
+        for (std::size_t k = 0; k < rows.size(); ++k) rows[k][1] = shortest(1.001 * std::cos(1 + 0.03 * static_cast<double>(k)));
+      },
+      {"t", "x"});
+  try {
+    derive(crank, log);
+    FAIL() << "phi follows";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(), testing::AllOf(testing::StartsWith("log.csv: near t = "),
+                                             HasSubstr(" the constraints do not determine phi from x: a dead centre, or "),
+                                             testing::EndsWith("). Log phi too, or another coordinate")));
+  }
+}
+
 TEST(Derive, SameBitsForAnyNumberOfThreads) {
   const SimulatedLog log = short_log();
   const DerivedData one = derive(pendulum(), log.table, {.n_threads = 1}),

@@ -194,6 +194,17 @@ TEST(EvaluateJob, MeasuresByTheNoiseThatTheTestLogStates) {
   EXPECT_GT(std::abs(by_training.nlpd - by_test.nlpd), 0.3);
 }
 
+TEST(EvaluateJob, WarnsOfIntervalsThatHoldFewOfTheValues) {
+  FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddy,ddheading", false)}});
+  const CsvTable test = log_of("test.csv", 40, ",ddx,ddy,ddheading", false);
+  const auto warned = Contains(HasSubstr("% of the values lie within their 95 % intervals"));
+  EXPECT_THAT(evaluate(fit.file, fit.posterior, test, {}).notes, Not(warned));
+  ModelValues values = fit.posterior.values();
+  values.noise_stddev = {VectorXd::Constant(3, 1e-6)};
+  const Posterior sure(fit.posterior.prior(), fit.posterior.observations(), values);
+  EXPECT_THAT(evaluate(fit.file, sure, test, {}).notes, warned);
+}
+
 TEST(EvaluateJob, TakesAFactorThatTrainingFoundForStatedNoise) {
   FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddx_std", false, "0.7")}});
   ModelValues values = fit.posterior.values();

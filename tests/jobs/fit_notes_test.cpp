@@ -303,6 +303,9 @@ TEST(FitNotes, WarnWhereLeftOutRowsDenyTheModel) {
   EXPECT_THAT(note_of(scores_of(0.01, 5000, 37000, 0.31, 201)),
               ElementsAre(AllOf(StartsWith("warning: the fit predicts unseen stretches"),
                                 HasSubstr("badly, worse than their mean would"))));
+  EXPECT_THAT(
+      note_of(scores_of(0.01, 0.95, 0.97, 0.95, 40)),
+      ElementsAre(StartsWith("warning: the fit predicts unseen stretches of the log badly, hardly better than their mean")));
   CrossValidation rows = scores_of(0.01, 1.2, 0, 0, 60);
   rows.stretches.reset();
   EXPECT_THAT(note_of(rows), ElementsAre(StartsWith("warning: the fit predicts rows left out one by one badly, worse than")));

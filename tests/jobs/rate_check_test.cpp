@@ -103,8 +103,20 @@ TEST(RateCheck, ALagIsNamedHoweverFineTheLog) {
 
 TEST(RateCheck, AFactorIsNamedUnderNoiseThatHidesSingleRows) {
   EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = -1}.text()), testing::EndsWith(": a wrong sign"));
-  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = 180 / std::numbers::pi}.text()),
+  const Swing degrees{.dt = 0.001, .noise = 0.01, .factor = 180 / std::numbers::pi};
+  EXPECT_THAT(degrees.text(true),
               testing::AllOf(HasSubstr("the rate is 0.017"), testing::EndsWith(" × the column: degrees instead of radians")));
+  EXPECT_THAT(degrees.text(), testing::EndsWith(": degrees instead of radians, if it is an angle"));
+}
+
+TEST(RateCheck, AClockInMinutesOrHoursIsNotTakenForDegrees) {
+  for (const bool wraps : {false, true}) {
+    EXPECT_THAT((Swing{.factor = 1 / 60.0}.text(wraps)), testing::EndsWith(": t in minutes instead of seconds"));
+    EXPECT_THAT((Swing{.factor = 60}.text(wraps)), testing::EndsWith(": a rate per minute instead of per second"));
+    EXPECT_THAT((Swing{.factor = 1 / 3600.0}.text(wraps)), testing::EndsWith(": t in hours instead of seconds"));
+    EXPECT_THAT((Swing{.factor = 3600}.text(wraps)), testing::EndsWith(": a rate per hour instead of per second"));
+    EXPECT_THAT((Swing{.factor = 1 / 50.0}.text(wraps)), testing::EndsWith(": a unit or a sign, or the clock"));
+  }
 }
 
 TEST(RateCheck, AnOffsetIsNamed) {

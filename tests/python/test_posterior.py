@@ -2,6 +2,7 @@
 
 import json
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -85,6 +86,15 @@ def test_python_threads_predict_at_the_same_time_as_the_data_grow(posterior, arm
 
 
 # ---------------------------------------------------------------- data that grow
+
+
+def test_export_makes_its_folder(posterior, tmp_path):
+    folder = tmp_path / "controller" / "c"
+    paths = posterior.export(folder, name="arm")
+    assert paths and {Path(path).parent for path in paths} == {folder}
+    assert all(Path(path).is_file() for path in paths)
+    with pytest.raises(gp2.InputError, match="the folder cannot be made: "):
+        posterior.export(paths[0])
 
 
 def test_update_is_the_fit_of_all_data_under_the_same_hyperparameters(arm, arm_log, arm_states, tmp_path):
