@@ -201,6 +201,19 @@ acceleration = ["-0.4*dx", "0"]
   EXPECT_TRUE(problem_of_data(stated).prior_options.feature_centres.empty());
 }
 
+TEST(DefaultPrior, HasARoughTermAlongDirectionsThatAreGiven) {
+  const auto kernel_of = [](const std::string& latent, const PriorOptions& options = {}) {
+    return make_prior(sledge("[[latent]]\nfeatures = [\"dx\"]\n" + latent), options).latents.front().kernel.text();
+  };
+  const std::string along = "directions = { force = [[\"1\"], [\"0\"]] }\n";
+  EXPECT_EQ(kernel_of(along), "se + matern32 + linear");
+  EXPECT_EQ(kernel_of(along + "kernel = \"rq\"\n"), "rq");
+  EXPECT_EQ(kernel_of("directions = \"force\"\n"), "se + linear");
+  PriorOptions everywhere;
+  everywhere.base = Latent::Base::force;
+  EXPECT_EQ(kernel_of(along, everywhere), "se + linear");
+}
+
 // Where its mean is rounded it is not 0 about it, and a spread of rounding would be its lengthscale.
 TEST(DefaultPrior, OfAFeatureThatDoesNotVaryIsScaledByItsSize) {
   const Model model = Model::parse(R"toml(

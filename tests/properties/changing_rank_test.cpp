@@ -60,8 +60,7 @@ std::string text_of(const std::vector<Finding>& findings, Finding::Level level) 
 
 TEST(ChangingRankTest, StatesOfLowerRankAreCounted) {
   const Model lets_go = model_with(R"-(["x*(ddx - ddy)", "ddz"])-");
-  const MechanicsBatch mechanics = require_mechanics(*lets_go.system, states(), VectorXd());
-  const LowerRank lower = states_of_lower_rank(mechanics);
+  const LowerRank lower = states_of_lower_rank(*lets_go.system, states(), VectorXd());
   EXPECT_EQ(lower.usual, 2);
   EXPECT_EQ(lower.lowest, 1);
   EXPECT_EQ(lower.states, (std::vector<int>{2, 6}));
@@ -81,7 +80,7 @@ TEST(ChangingRankTest, StatesOfLowerRankAreCounted) {
 
 TEST(ChangingRankTest, ConstraintsOfOneRankAreNoteworthyToNobody) {
   const Model constant = model_with(R"-(["ddx - ddy", "2*ddx - 2*ddy", "ddz"])-");
-  EXPECT_TRUE(states_of_lower_rank(require_mechanics(*constant.system, states(), VectorXd())).states.empty());
+  EXPECT_TRUE(states_of_lower_rank(*constant.system, states(), VectorXd()).states.empty());
   EXPECT_EQ(text_of(check_system(*constant.system, states(), VectorXd()), Finding::Level::warning), "");
   EXPECT_THAT(make_fit_problem(constant, log_of(constant), {}).notes, testing::Not(Contains(HasSubstr("rank"))));
 }
