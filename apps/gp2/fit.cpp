@@ -280,7 +280,9 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_what_is_asked(arguments.request.problem, given);
   require_output(arguments.output, inputs_of(arguments));
   if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments), "--smoothed");
-  if (std::filesystem::weakly_canonical(arguments.smoothed) == std::filesystem::weakly_canonical(arguments.output)) {
+  std::error_code unknown;  // of a path that is no file yet
+  if (!arguments.smoothed.empty() && std::filesystem::weakly_canonical(arguments.smoothed, unknown) ==
+                                         std::filesystem::weakly_canonical(arguments.output, unknown)) {
     throw InputError(fmt::format("--smoothed {}: the fit goes there (-o); write to another file", arguments.smoothed));
   }
   const std::string checkpoint = arguments.request.checkpoint;

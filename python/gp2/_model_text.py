@@ -34,7 +34,7 @@ def model_text(
 ) -> str:
     mechanics = {"mass": mass, "force": force, "force_on": force_on, "potential": potential, "coriolis": coriolis}
     if not isinstance(constraints, Mapping):
-        constraints = {"position": constraints} if constraints else {}
+        constraints = {} if constraints is None or len(constraints) == 0 else {"position": constraints}
     if noise is not None and not (isinstance(noise, Mapping) and "ddq" in noise):
         noise = {"ddq": noise}
     if truth is not None and not isinstance(truth, Mapping):
@@ -44,7 +44,7 @@ def model_text(
     if robot is not None:
         lines.append(f"robot = {_value(fspath(robot))}")
     if coordinates is not None or robot is None:
-        lines.append(f"coordinates = {_value(coordinates or [])}")
+        lines.append(f"coordinates = {_value([] if coordinates is None else coordinates)}")
     lines.append(f"inputs = {_value(inputs)}")
     tables = {
         "parameters": parameters,
@@ -60,12 +60,13 @@ def model_text(
         "drawing": drawing,
     }
     for table, entries in tables.items():
-        _require_mapping(table, entries or {})
-        if written := _entries(entries or {}):
+        entries = {} if entries is None else entries
+        _require_mapping(table, entries)
+        if written := _entries(entries):
             lines += ["", f"[{table}]", *written]
     if isinstance(latents, (str, Mapping)):
         raise TypeError(f"latents: expected a list of mappings, one for each latent, got {latents!r}")
-    for latent in latents:
+    for latent in latents if latents is not None else ():
         _require_mapping("latents", latent)
         lines += ["", "[[latent]]", *_entries(latent)]
     return "\n".join(lines) + "\n"

@@ -98,6 +98,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Raises gp2.InputError, a ValueError, where X, y, the options and the system do not go together; gp2.NumericalError.
         """
+        self.__dict__.pop("posterior_", None)  # of an earlier fit, should this one fail
         system = self._given_system()
         self._has_mechanics = system is not None
         if system is not None:
@@ -169,7 +170,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def score(self, X, y, sample_weight=None) -> float:
         """R² of the prediction, the mean over the columns of y."""
-        check_is_fitted(self)
+        check_is_fitted(self, "posterior_")
         return super().score(X, _columns_by_name(y, self.outputs_) if self._has_mechanics else y, sample_weight)
 
     def _given_system(self) -> gp2.System | None:
@@ -214,7 +215,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return states
 
     def _checked_states(self, X) -> np.ndarray:
-        check_is_fitted(self)
+        check_is_fitted(self, "posterior_")
         if not self._has_mechanics:
             return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False), None)
         # scikit-learn would compare number and order of the columns with those of fit, but the system says what they are

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -92,7 +93,7 @@ void Writer::write_tests() {
   const Predictor before(posterior_.without_data(), view_, {true, false, Predictor::Storage::double_precision});
   Predictor::Workspace workspace = predictor.make_workspace(), workspace_before = before.make_workspace();
   const Index nr = view_.size(), nx = layout_.size();
-  VectorXd mean(nr), stddev = VectorXd::Zero(nr), at_zero(nr), prior(nr);
+  VectorXd mean(nr), at_rounded(nr), stddev = VectorXd::Zero(nr), at_zero(nr), prior(nr);
   MatrixXd jacobian(nr, nx);
   std::string& tests = text("tests");
   int n = 0;
@@ -114,6 +115,18 @@ void Writer::write_tests() {
     if (has("jacobian")) tests += fmt::format("     {{{}}},\n", numbers(jacobian.data(), nr * nx));
     const double largest = std::max(1.0, mean.cwiseAbs().maxCoeff());
     std::vector<std::string> errors = {number(precision * largest + rounding)};
+    if (options_.single_precision) {
+      const VectorXd rounded = state.cast<float>().cast<double>();
+      const bool is_ok = predictor.mean(rounded, at_rounded, workspace) == Predictor::Status::ok;
+      const double moved = is_ok ? (at_rounded - mean).cwiseAbs().maxCoeff() : std::numeric_limits<double>::infinity();
+      if (!(moved <= precision * largest + rounding)) {
+        throw InputError(
+            fmt::format("export to C: in single precision the states themselves are too coarse: rounding one of them moves the "
+                        "mean by {:.2g}. "
+                        "Let time and coordinates start near 0, or leave `float` out",
+                        moved));
+      }
+    }
     // a latent along which nothing of a view acts has a deviation of rounding there
     const double cancelled = 32 * roundoff(options_.single_precision) * largest;
     // what double precision leaves of a variance that the observations take from the prior's

@@ -23,10 +23,14 @@ namespace {
 
 const std::set<std::string>& taken_names() {
   static const std::set<std::string> names = {
-      "auto",   "break",  "case",   "char",   "const",  "continue",   "default", "do",        "double",   "else",     "enum",
-      "extern", "float",  "for",    "goto",   "if",     "inline",     "int",     "long",      "register", "restrict", "return",
-      "short",  "signed", "sizeof", "static", "struct", "switch",     "typedef", "union",     "unsigned", "void",     "volatile",
-      "while",  "state",  "w",      "real",   "out",    "parameters", "status",  "workspace", "NAN",      "INFINITY", "HUGE_VAL"};
+      "alignas", "alignof", "asm", "auto", "bool", "break", "case", "char", "const", "constexpr", "continue", "default", "do",
+      "double", "else", "enum", "extern", "false", "float", "for", "goto", "if", "inline", "int", "linux", "long", "nullptr",
+      "register", "restrict", "return", "short", "signed", "sizeof", "static", "struct", "switch", "true", "typedef", "typeof",
+      "static_assert", "thread_local", "union", "unix", "unsigned", "void", "volatile", "while", "state", "w", "real", "out",
+      "parameters", "status", "workspace",
+      // macros of math.h
+      "NAN", "INFINITY", "HUGE_VAL", "M_E", "M_LOG2E", "M_LOG10E", "M_LN2", "M_LN10", "M_PI", "M_PI_2", "M_PI_4", "M_1_PI",
+      "M_2_PI", "M_2_SQRTPI", "M_SQRT2", "M_SQRT1_2"};
   return names;
 }
 

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include <fmt/format.h>
+
 namespace gp2::c_export {
 
 bool Filling::has(const std::string& condition) const {
@@ -68,7 +70,7 @@ std::string called_pieces(std::span<const Piece> pieces, std::string users) {
   std::string out;
   for (auto piece = pieces.rbegin(); piece != pieces.rend(); ++piece) {
     if (users.find(std::string(piece->name) + "(") == std::string::npos) continue;
-    out = "\n" + std::string(piece->text) + out;
+    out = fmt::format("\n{}{}", piece->text, out);
     users += piece->text;
   }
   return out;

@@ -14,6 +14,7 @@
 
 #include "export/xml_text.hpp"
 #include "gp2/error.hpp"
+#include "robots/robot_checks.hpp"
 
 namespace gp2 {
 
@@ -208,7 +209,7 @@ class RobotWriter {
   // A rigid body has a positive mass, positive principal moments, and none of them is larger than the sum of the others.
   void say_whether_physical(const Body& body) {
     const Vector3d moments = Eigen::SelfAdjointEigenSolver<Matrix3d>(body.inertia, Eigen::EigenvaluesOnly).eigenvalues();
-    if (body.mass > 0 && moments[0] > 0 && moments[2] <= moments[0] + moments[1]) return;
+    if (body.mass > 0 && moments[0] > 0 && is_of_rigid_body(body.inertia)) return;
     out_.is_physical = false;
     out_.notes.push_back(fmt::format(
         "warning: no rigid body has the mass {} and the principal moments {}, {}, {} that were fitted for {} '{}', and "

@@ -26,10 +26,10 @@ double clearness(const LearnedForce& one, Index row) {
   return reach / std::max(std::sqrt(one.stddev.row(row).array().square().mean()), 1e-300);
 }
 
-// "x" of force_x@slide
+// "x" of force_x@slide, "coefficient" of coefficient@slide
 std::string coordinate_of(const std::string& name) {
-  const std::size_t begin = name.find('_') + 1;
-  return name.substr(begin, name.find('@') - begin);
+  const std::string of = name.substr(0, name.find('@'));
+  return of.substr(of.find('_') + 1);
 }
 
 std::vector<std::string> distinct(std::vector<std::string> names) {

@@ -50,43 +50,60 @@ void SwitchingFunctions::evaluate(const Eigen::Ref<const VectorXd>& state, const
 
 namespace {
 
-// The surfaces at which expressions jump: arguments of sign(), and those whose length is a denominator, |v| or √(v² + w²), that read a
-// velocity and no input, each once and each factor by itself, without constants: sign(v), sign(−2 v), sign(lambda(1) v) and v/|v| are
-// of one surface, as are sign(v − w) and sign(w − v).
+// The surfaces at which expressions jump: arguments of sign(), and those whose length is a factor of a denominator, |v| or
+// √(v² + w²), that read a velocity and no input, each once and each factor by itself, without constants: sign(v), sign(−2 v),
+// sign(lambda(1) v), v/|v| and v/(2 |−v|) are of one surface, as are sign(v − w) and sign(w − v).
 class JumpsOf {
  public:
   JumpsOf(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
 
-  void add(Expression e) {
-    if (!seen_.insert(e.id()).second || internal::is_leaf(e.operation())) return;
-    if (e.operation() == Operation::sign) add_factors(e.left());
-    if (e.operation() == Operation::divide && e.right().operation() == Operation::abs) add_factors(e.right().left());
-    if (e.operation() == Operation::divide && e.right().operation() == Operation::sqrt) add_length(e.right().left());
-    if (e.operation() == Operation::power && e.right().is_constant(-0.5)) add_length(e.left());
-    add(e.left());
-    if (internal::is_binary(e.operation())) add(e.right());
+  void add(Expression root) {
+    // a stack of its own: expressions are as deep as a file makes them
+    std::vector<Expression> open = {root};
+    while (!open.empty()) {
+      const Expression e = open.back();
+      open.pop_back();
+      if (!seen_.insert(e.id()).second || internal::is_leaf(e.operation())) continue;
+      if (e.operation() == Operation::sign) add_factors(e.left());
+      if (e.operation() == Operation::divide) add_lengths(e.right());
+      if (e.operation() == Operation::power && e.right().is_constant(-0.5)) add_length(e.left());
+      if (internal::is_binary(e.operation())) open.push_back(e.right());
+      open.push_back(e.left());
+    }
   }
   [[nodiscard]] const std::vector<std::vector<Expression>>& found() const { return found_; }
 
  private:
-  void add_factors(Expression g) {
-    while (true) {
+  void add_factors(Expression product) {
+    std::vector<Expression> open = {product};
+    while (!open.empty()) {
+      const Expression g = open.back();
+      open.pop_back();
+      if (!seen_factors_.insert(g.id()).second) continue;
       if (g.operation() == Operation::negate) {
-        g = g.left();
-      } else if (g.operation() == Operation::multiply && g.left().is_constant()) {
-        g = g.right();
-      } else if (g.operation() == Operation::divide && g.right().is_constant()) {
-        g = g.left();
-      } else {
-        break;
+        open.push_back(g.left());
+      } else if (g.operation() == Operation::multiply || g.operation() == Operation::divide) {
+        open.push_back(g.right());
+        open.push_back(g.left());
+      } else if (reads_velocity(g)) {
+        add_surface({g});
       }
     }
-    if (g.operation() == Operation::multiply || g.operation() == Operation::divide) {
-      add_factors(g.left());
-      add_factors(g.right());
-      return;
+  }
+
+  // those among the factors of a divisor
+  void add_lengths(Expression divisor) {
+    std::vector<Expression> open = {divisor};
+    while (!open.empty()) {
+      const Expression e = open.back();
+      open.pop_back();
+      if (!seen_in_divisors_.insert(e.id()).second) continue;
+      const bool is_product = e.operation() == Operation::multiply;
+      if (e.operation() == Operation::abs) add_factors(e.left());
+      if (e.operation() == Operation::sqrt) add_length(e.left());
+      if (is_product) open.push_back(e.right());
+      if (is_product || e.operation() == Operation::divide || e.operation() == Operation::negate) open.push_back(e.left());
     }
-    if (reads_velocity(g)) add_surface({g});
   }
 
   // the terms of a sum of squares, each alone 0 where the sum is
@@ -149,7 +166,7 @@ class JumpsOf {
 
   ExpressionGraph& graph_;
   const SystemSymbols& symbols_;
-  std::set<std::uint32_t> seen_;
+  std::set<std::uint32_t> seen_, seen_factors_, seen_in_divisors_;
   std::vector<std::vector<Expression>> found_;
 };
 

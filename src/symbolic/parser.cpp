@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdint>
 #include <functional>
+#include <map>
 #include <numbers>
 #include <numeric>
 #include <optional>
@@ -16,6 +17,7 @@
 #include "gp2/error.hpp"
 #include "gp2/symbolic/expression.hpp"
 #include "symbolic/functions.hpp"
+#include "symbolic/graph.hpp"
 
 namespace gp2 {
 
@@ -40,43 +42,41 @@ std::string joined(const Names& names, std::string_view separator) {
   return text;
 }
 
-// what a product, and with `of_sum` a sum of products, is made of: all operands on the way down to its factors
-void parts_of(Expression e, bool of_sum, const std::function<void(Expression)>& visit) {
-  std::set<std::uint32_t> seen;
+// Ids of expressions.
+using Parts = std::set<std::uint32_t>;
+
+// Adds to `seen` what a product, and with `of_sum` a sum of products, is made of: all operands on the way down to its factors, but
+// for numbers. Those that are new are visited.
+void parts_of(Expression e, bool of_sum, Parts& seen, const std::function<void(Expression)>& visit = nullptr) {
+  const std::size_t n_before = seen.size();
   std::vector<Expression> open = {e};
   while (!open.empty()) {
     const Expression part = open.back();
     open.pop_back();
-    if (!seen.insert(part.id()).second) continue;
-    visit(part);
+    if (part.is_constant() || !seen.insert(part.id()).second) continue;
+    if (visit) visit(part);
     const Operation operation = part.operation();
     const bool has_two = operation == Operation::multiply || (of_sum && operation == Operation::add);
     if (has_two || operation == Operation::divide || operation == Operation::negate) open.push_back(part.left());
     if (has_two) open.push_back(part.right());
   }
+  internal::StepLimit::count(seen.size() - n_before);
 }
 
-// whether a factor of a product is a component g of a length |g| or √(g² + …)
-bool has_component(Expression product, Expression length) {
-  std::set<std::uint32_t> components;
-  if (length.operation() == Operation::abs) components.insert(length.left().id());
-  if (length.operation() == Operation::sqrt) {
-    parts_of(length.left(), /*of_sum=*/true, [&](Expression e) {
+// The components g of lengths |g| or √(g² + …) among the factors of a divisor, each with its own factors: which of them are
+// parameters is not known here.
+Parts components_in(Expression divisor) {
+  Parts components, factors, terms;
+  parts_of(divisor, /*of_sum=*/false, factors, [&](Expression length) {
+    if (length.operation() == Operation::abs) parts_of(length.left(), /*of_sum=*/false, components);
+    if (length.operation() != Operation::sqrt) return;
+    parts_of(length.left(), /*of_sum=*/true, terms, [&](Expression e) {
       const bool is_square = (e.operation() == Operation::power && e.right().is_constant(2)) ||
                              (e.operation() == Operation::multiply && e.left() == e.right());
-      if (is_square) components.insert(e.left().id());
+      if (is_square) parts_of(e.left(), /*of_sum=*/false, components);
     });
-  }
-  if (components.empty()) return false;
-  bool found = false;
-  parts_of(product, /*of_sum=*/false, [&](Expression e) { found = found || components.count(e.id()) > 0; });
-  return found;
-}
-
-// A component over its length jumps where both are 0, and is 0 there as sign(0) is, the mean of all directions.
-Expression quotient(Expression a, Expression b) {
-  if (!has_component(a, b)) return a / b;
-  return a.graph().apply(Operation::multiply_or_zero, a, a.graph().constant(1) / b);
+  });
+  return components;
 }
 
 /// Recursive descent, one function per rule of the grammar:
@@ -166,13 +166,31 @@ class Parser {
 
   Expression product() {
     Expression result = factor();
+    Parts parts;  // of the result, as far as it was looked at
     while (peek() == '*' || peek() == '/') {
       if (text_.substr(position_, 2) == "**") fail(position_, "found '**'; a power is written ^");
       const char sign = take();
       const Expression right = factor();
-      result = sign == '*' ? result * right : quotient(result, right);
+      result = sign == '*' ? result * right : quotient(result, right, parts);
     }
     return result;
+  }
+
+  /// A component over its length jumps where both are 0, and is 0 there as sign(0) is, the mean of all directions.
+  /// @param parts  those of `a` that were looked at, so that a long product is looked at once
+  Expression quotient(Expression a, Expression b, Parts& parts) {
+    const auto [found, is_new] = components_.try_emplace(b.id());
+    if (is_new) found->second = components_in(b);
+    const Parts& components = found->second;
+    if (components.empty()) return a / b;
+    parts_of(a, /*of_sum=*/false, parts);
+    internal::StepLimit::count(components.size());
+    const auto is_part = [&](std::uint32_t id) { return parts.count(id) > 0; };
+    if (std::none_of(components.begin(), components.end(), is_part)) return a / b;
+    parts.clear();
+    // a sign in the denominator would rise out of 1/b
+    if (b.operation() == Operation::negate) a = -a, b = b.left();
+    return graph_.apply(Operation::multiply_or_zero, a, graph_.constant(1) / b);
   }
 
   Expression factor() {
@@ -447,6 +465,7 @@ class Parser {
   std::span<const std::string> known_names_;
   std::size_t position_ = 0;
   int depth_ = 0;
+  std::map<std::uint32_t, Parts> components_;  // in divisors, by their ids
 };
 
 }  // namespace

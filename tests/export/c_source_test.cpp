@@ -562,6 +562,38 @@ TEST(CSourceTest, InSinglePrecisionIsRefusedWhereItWouldShow) {
                              HasSubstr("its weights cancel. Fewer rows or a larger noise help, or leave `float` out")));
 }
 
+// seven digits hold no second of a Unix time
+TEST(CSourceTest, InSinglePrecisionIsRefusedWhereStatesAreTooCoarse) {
+  const Model model = Model::parse(R"toml(
+name        = "cart that is shaken"
+coordinates = ["x"]
+[mechanics]
+mass  = [["1"]]
+force = ["cos(2*t)"]
+[[latent]]
+kernel   = "se"
+features = ["x"]
+)toml",
+                                   "cart that is shaken");
+  CSourceOptions options;
+  options.single_precision = true;
+  const auto error_at = [&](double start) {
+    Problem p;
+    p.prior = make_prior(model, {Prior::Mean::force, std::nullopt, false});
+    RandomStream random(export_seed);
+    MatrixXd states = test::random_matrix(3, 6, random);
+    states.row(2) = Eigen::RowVectorXd::LinSpaced(6, start, start + 5);
+    p.observations = {{states, View::constrained_acceleration(*model.system), MatrixXd(test::random_matrix(1, 6, random)),
+                       VectorXd::Constant(1, 0.3), false}};
+    p.values = test::random_values(p.prior, p.observations, random);
+    const Posterior posterior = test::posterior_of(p);
+    return input_error_of(
+        [&] { static_cast<void>(export_c(posterior, View::constrained_acceleration(*model.system), options)); });
+  };
+  EXPECT_EQ(error_at(0), "");
+  EXPECT_THAT(error_at(1.7e9), HasSubstr("in single precision the states themselves are too coarse"));
+}
+
 TEST(CSourceTest, SaysWhatCannotBeWritten) {
   const Problem p = problem_of("surface");
   const View view = View::constrained_acceleration(*p.prior.system);

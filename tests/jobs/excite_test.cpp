@@ -345,7 +345,9 @@ TEST(Excitation, SaysWhatIsWrongWithARequest) {
       {[](auto& r) { r.duration = std::nan(""); }, "`duration`: must be positive, got nan"},
       {[](auto& r) { r.n_motions = 0; }, "`motions`: must be at least 1, got 0"},
       {[](auto& r) { r.n_harmonics = 0; }, "`harmonics`: must be at least 1, got 0"},
-      {[](auto& r) { r.n_rows = 31; }, "`rows`: must be at least 32, four for each of the 8 harmonics, got 31"},
+      {[](auto& r) { r.n_rows = 31; }, "`rows`: must be at least four for each of the 8 harmonics and at most 1000000, got 31"},
+      {[](auto& r) { r.n_harmonics = 1'000'000'000; },
+       "`rows`: must be at least four for each of the 1000000000 harmonics and at most 1000000, got 60"},
       {[](auto& r) { r.inputs_within = {}; },
        "`inputs_within`: no limits of 'push'; give its lowest and highest value, 0:0 to leave it out"},
       {[](auto& r) {

@@ -61,18 +61,21 @@ TEST(FitNotes, NameWhatEndedAtABound) {
 }
 
 TEST(FitNotes, NameStatedDeviationsThatAreFarTooSmall) {
-  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
-  FitOptions nothing;
-  nothing.max_iterations = 0;
-  const Posterior posterior = fit(problem_of(constrained_cart(""), log), nothing).posterior;
-  FitReport report;
-  report.iterations = 10;
-  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddx", 7, 0.2, 100),
-                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddy", 4, 0.2, 100)};
-  EXPECT_THAT(notes_of(report, posterior), testing::IsEmpty());  // they are no factors
-  for (Hyperparameter& h : report.hyperparameters) h.unit = "stated deviation of " + h.name;
-  EXPECT_THAT(notes_of(report, posterior),
-              ElementsAre(StartsWith("noise of ddx = 7: the standard deviations in the log are too")));
+  const auto notes_for = [](const char* log) {
+    FitOptions nothing;
+    nothing.max_iterations = 0;
+    const Posterior posterior = fit(problem_of(constrained_cart(""), CsvTable::parse(log, "log.csv")), nothing).posterior;
+    FitReport report;
+    report.iterations = 10;
+    report.hyperparameters = {hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddx", 7, 0.2, 100),
+                              hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddy", 7, 0.2, 100)};
+    report.hyperparameters[1].index = 1;
+    return notes_of(report, posterior);
+  };
+  EXPECT_THAT(notes_for("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n"), testing::IsEmpty()) << "they are no factors";
+  EXPECT_THAT(notes_for("x,y,dx,dy,ddx,ddy,ddx_std\n1,2,3,4,5,0,1\n2,3,4,5,6,0,1\n"),
+              ElementsAre(StartsWith("noise of ddx = 7: the standard deviations in the log are too")))
+      << "that of ddy has none";
 }
 
 TEST(FitNotes, TellOfFewValuesForWhatIsEstimated) {

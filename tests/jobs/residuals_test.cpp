@@ -557,10 +557,12 @@ mass = [["1.5", "0"], ["0", "0.7"]]
 force = ["u", "0"]
 [[latent]]
 name = "spring"
+kernel = "se + linear"
 features = ["x - y"]
 directions = {{ force = [["1"], ["{}"]] }}
 [[latent]]
 name = "drag"
+kernel = "se + linear"
 features = ["dy"]
 directions = {{ force = [["0"], ["1"]] }}
 [noise]

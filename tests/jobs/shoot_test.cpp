@@ -346,6 +346,8 @@ TEST(Shoot, SaysWhatIsWrong) {
   const auto fault = [&](const ShootRequest& request) { return input_error_of([&] { shoot(fit, log, request); }); };
   EXPECT_THAT(fault({.duration = -1}), HasSubstr("`duration`: must be positive and finite, got -1"));
   EXPECT_THAT(fault({.duration = NAN}), HasSubstr("`duration`: must be positive and finite, got nan"));
+  EXPECT_THAT(fault({.duration = 1e300}), HasSubstr("no stretch of 1e+300 s with at least 8 rows"));
+  EXPECT_THAT(input_error_of([&] { shoot(fit, log.take({0}), {}); }), HasSubstr("t never increases from one row to the next"));
   EXPECT_THAT(fault({.duration = 0.02}), HasSubstr("no stretch of 0.02 s with at least 8 rows"));
   EXPECT_THAT(fault({.duration = 1, .most_stretches = 0}), HasSubstr("`stretches`: must be at least 1, got 0"));
   EXPECT_THAT(fault({.threads = -1}), HasSubstr("threads"));

@@ -136,6 +136,46 @@ TEST(Check, AWrongBIsFound) {
   EXPECT_THAT(finding.text, HasSubstr("largest for 'd/dt of wire'"));
 }
 
+TEST(Check, AFastMechanismIsFollowedByShorterSteps) {
+  const Model model = Model::parse(R"(
+coordinates = ["a", "b", "c"]
+[mechanics]
+mass = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+[constraints]
+position = ['0.1*cos(a) + 0.3*cos(b) - c', '0.1*sin(a) + 0.3*sin(b)']
+)",
+                                   "a slider-crank");
+  for (const double speed : {1.0, 100.0, 2000.0, 1e5}) {
+    MatrixXd states(7, 20);
+    for (Eigen::Index i = 0; i < states.cols(); ++i) {
+      const double a = 0.3 * static_cast<double>(i), b = std::asin(-std::sin(a) / 3);
+      const double db = -std::cos(a) / (3 * std::cos(b)) * speed, dc = -0.1 * std::sin(a) * speed - 0.3 * std::sin(b) * db;
+      states.col(i) << a, b, 0.1 * std::cos(a) + 0.3 * std::cos(b), speed, db, dc, 0;
+    }
+    const Finding finding = motion_finding(*model.system, states);
+    EXPECT_EQ(finding.level, Finding::Level::good) << speed << ": " << finding.text;
+  }
+}
+
+TEST(Check, ATimeOfAClockIsSteppedAsItRounds) {
+  const Model model = Model::parse(
+      "coordinates = ['x']\n[parameters]\nw = 3\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = ['x - sin(w*t)']\n",
+      "a moved body");
+  for (const double w : {2.7, 3.0, 50.0}) {
+    for (const double start : {0.0, 1.7e9}) {
+      MatrixXd states(3, 1000);
+      for (Eigen::Index i = 0; i < states.cols(); ++i) {
+        const double t = start + 0.01 * static_cast<double>(i);
+        states.col(i) << std::sin(w * t), w * std::cos(w * t), t;
+      }
+      for (Finding& finding : check_system(*model.system, states, Eigen::VectorXd::Constant(1, w))) {
+        if (!finding.text.starts_with("A and b:")) continue;
+        EXPECT_EQ(finding.level, Finding::Level::good) << w << ": " << finding.text;
+      }
+    }
+  }
+}
+
 std::string all_of(const std::vector<Finding>& findings) {
   std::string text;
   for (const Finding& finding : findings) text += finding.text + "\n";

@@ -221,6 +221,13 @@ def test_the_state_that_has_no_prediction_is_named_by_its_number_among_all():
         refuses(lambda m=mean_only: posterior.predict(states, mean_only=m), gp2.InputError, "at state 290001 (x = -1")
 
 
+def test_a_model_takes_arrays_of_names():
+    system = gp2.System(
+        coordinates=np.array(["x", "y"]), mass=np.eye(2), constraints=np.array(["x - y"]), latents=[{"features": ["dx"]}], noise=0.1
+    )
+    assert list(system.coordinates) == ["x", "y"] and system.evaluate(np.zeros((1, 5))).A.shape == (1, 1, 2)
+
+
 def test_a_ragged_list_is_refused(posterior):
     refuses(lambda: posterior.predict([[1.0, 2.0], [3.0]]), TypeError, "states: expected an array of numbers, got <class 'list'>")
 

@@ -355,6 +355,11 @@ def test_faults_of_the_user_are_told(data):
     X, y = data
     with pytest.raises(NotFittedError):
         GP2Regressor(WIRE).predict(X)
+    regressor = GP2Regressor(WIRE, max_iterations=3).fit(X, y)
+    with pytest.raises(gp2.InputError):
+        regressor.set_params(n_restarts=-1).fit(X, y)
+    with pytest.raises(NotFittedError):  # neither what an earlier fit found nor half of this one
+        regressor.predict(X)
     with pytest.raises(gp2.InputError, match=r"^X: expected 6 columns, x, z, dx, dz, t, push; got 5 feature"):
         GP2Regressor(WIRE).fit(X[:, :5], y)
     with pytest.raises(gp2.InputError, match=r"^y: expected columns ddx, ddz; got shape \(40,\)"):

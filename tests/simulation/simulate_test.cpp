@@ -178,6 +178,16 @@ TEST(SimulateDryFriction, OfAVelocityOverItsSizeIsThatOfItsSign) {
   EXPECT_LT(of_size.steps + of_size.rejected_steps, 500);
 }
 
+TEST(SimulateDryFriction, OfAVelocityOverAMultipleOfItsSizeRestsToo) {
+  for (const std::string friction : {"2*dx/(3*abs(dx))", "2*dx/(k*sqrt(dx^2))", "2*dx/abs(-3*dx)", "2*k*dx/(k*sqrt((k*dx)^2))"}) {
+    const Model model = bodies({"x"}, {"-" + friction}, "[parameters]\nk = 3\n");
+    const Trajectory out = simulate_switching(model, state_of(model, {{"dx", 1}}), with_tolerance(times(3, 31), 1e-9));
+    EXPECT_NEAR(out.states(0, 30), 0.75, 1e-9) << friction;
+    EXPECT_NEAR(out.states(1, 30), 0, 1e-9) << friction;
+    EXPECT_EQ(simulate_switching(model, state_of(model, {}), with_tolerance(times(1, 2), 1e-9)).states(0, 1), 0) << friction;
+  }
+}
+
 TEST(SimulateDryFriction, ASpringPullsABodyToWhereItSticks) {
   // half swings about ±μ/k, each shorter by 2 μ/k: 1, −0.4, −0.2, which is within ±0.3
   const Model model = bodies({"x"}, {"-x - 0.3*sign(dx)"});
@@ -290,8 +300,24 @@ TEST(SimulateDryFriction, IsFoundInForcesTruthAndLatents) {
                           "-dy*(dx^2 + 1e-6)^(-1/2) + (dx^2 + dy^2)^(-1/2)/sqrt(dx^2 + x^2) + sqrt(dx^2 + dy^2)"});
   EXPECT_EQ(switching_functions(lengths, false).names(),
             (std::vector<std::string>{"dx", "2*dy, x*(dx - dy)/1.7320508075688772", "dx, dy"}));
+  // with factors that do not move
+  const Model scaled =
+      bodies({"x", "y"}, {"-dx/(2*abs(dx)) - dx/abs(-k*dx)", "-k*dy/(k*sqrt((k*dy)^2 + dx^2)/2)"}, "[parameters]\nk = 2\n");
+  EXPECT_EQ(switching_functions(scaled, false).names(), (std::vector<std::string>{"dx", "k*dy, dx"}));
   // what two bodies do to each other, written as each of them sees it
   EXPECT_EQ(switching_functions(bodies({"x", "y"}, {"-sign(dx - dy)", "-sign(dy - dx)"}), false).size(), 1);
+}
+
+TEST(SimulateDryFriction, IsLookedForInForcesOfAnyDepth) {
+  // 300 000 sums below each other
+  std::string let = "s0 = \"dx\"\n";
+  for (int k = 1; k <= 30; ++k) {
+    let += fmt::format("s{} = \"s{}", k, k - 1);
+    for (int n = 0; n < 10'000; ++n) let += "+x";
+    let += "\"\n";
+  }
+  const Model model = bodies({"x"}, {"-sign(dx) + s30"}, "[let]\n" + let);
+  EXPECT_EQ(switching_functions(model, false).names(), std::vector<std::string>{"dx"});
 }
 
 // ---- dry friction in a plane

@@ -273,10 +273,31 @@ TEST_F(ParserTest, AComponentOverItsLengthIsZeroAtZero) {
   for (int k = 0; k < 100; ++k) shared = shared * shared + shared;
   const auto resolve = [&](std::string_view name) { return std::optional(name == "s" ? shared : graph.variable("q1")); };
   EXPECT_EQ(parse_expression("s*q1/sqrt(s + q1^2)", graph, resolve, {}).operation(), Operation::multiply_or_zero);
+  // the time of a long quotient grows with its length, whether its denominators are the same or not
+  const auto start = std::chrono::steady_clock::now();
+  std::string same = "q1", other = "q1";
+  for (int k = 0; k < 8000; ++k) same += "/abs(q2)";
+  for (int k = 0; k < 4000; ++k) other += "/abs(q2*" + std::to_string(k) + ".5)";
+  EXPECT_EQ(error(same) + error(other), "");
+  EXPECT_LT(std::chrono::steady_clock::now() - start, std::chrono::seconds(2));
   // other quotients have no value there
-  for (const std::string text : {"sin(q1)/abs(q1)", "q1/sqrt(q1)", "(q1 + q2)/abs(q1)"}) {
+  for (const std::string text : {"sin(q1)/abs(q1)", "q1/sqrt(q1)", "(q1 + q2)/abs(q1)", "2*sin(q1)/abs(2*q1)",
+                                 "q1/abs(q1)/abs(q1)", "q1/(3 + abs(q1) - 3)"}) {
     EXPECT_TRUE(std::isnan(test::evaluate(read(text), {{"q1", 0}, {"q2", 0}}))) << text;
   }
+}
+
+TEST_F(ParserTest, AComponentOverItsLengthMayHaveFactors) {
+  for (const std::string text : {"q1/(2*abs(q1))", "q1/(mass*sqrt(q1^2 + q2^2))", "q1/abs(2*q1)", "q1/abs(-q1)",
+                                 "mass*q1/sqrt((mass*q1)^2 + q2^2)", "-q1/(-abs(q1))", "q1/-abs(q1)", "q1/(abs(q1)/mass)",
+                                 "3*q1/mass/(-mass*abs(q1/mass))", "mass*q1/(q2 - q1 + 2)/abs(-2*mass*q1)"}) {
+    SCOPED_TRACE(text);
+    EXPECT_EQ(test::evaluate(read(text), {{"q1", 0}, {"q2", 0}, {"mass", 7}}), 0);
+    EXPECT_EQ(read(to_string(read(text))), read(text)) << to_string(read(text));
+  }
+  EXPECT_DOUBLE_EQ(value("q1/(mass*sqrt(q1^2 + q2^2))"), 2 / (7 * std::sqrt(13)));
+  EXPECT_DOUBLE_EQ(value("dq2/(-2*abs(3*dq2))"), 1.0 / 6);
+  EXPECT_DOUBLE_EQ(value("dq2/(abs(-dq2)/mass)"), -7);
 }
 
 }  // namespace

@@ -379,5 +379,33 @@ TEST(LaplaceTest, NotesSayWhichParametersStandardErrorsHoldAtABound) {
   EXPECT_EQ(notes[0].text, "the standard errors hold g at the bound");
 }
 
+// draws would tell the width of the bounds
+TEST(LaplaceTest, DrawsGiveNoErrorToWhatTheDataLeaveOpenOrAtABound) {
+  FitReport report;
+  for (const char* name : {"open", "at bound", "known"}) {
+    Hyperparameter& h =
+        report.hyperparameters.emplace_back(Hyperparameter::of(Kind::parameter, 0, report.hyperparameters.size()));
+    h.name = name;
+    h.lower = 0;
+    h.upper = h.value = 1;
+  }
+  report.hyperparameters[0].value = report.hyperparameters[2].value = 0.5;
+  LaplaceUncertainty& uncertainty = report.uncertainty.emplace();
+  uncertainty.stddev = Eigen::Vector3d(std::numeric_limits<double>::infinity(), 0, 0.1);
+  uncertainty.correlation = MatrixXd::Identity(3, 3);
+  HyperparameterDraws& draws = report.draws.emplace();
+  draws.mean = Eigen::Vector3d(0.4, 0.9, 0.5);
+  draws.stddev = Eigen::Vector3d(0.01, 0.02, 0.2);
+  draws.lower = draws.mean - 2 * draws.stddev;
+  draws.upper = draws.mean + 2 * draws.stddev;
+  draws.correlation = MatrixXd::Identity(3, 3);
+  EXPECT_TRUE(std::isinf(parameter_uncertainty(report, 0).stddev));
+  EXPECT_FALSE(parameter_uncertainty(report, 0).is_of_draws);
+  EXPECT_TRUE(std::isnan(parameter_uncertainty(report, 1).stddev));
+  EXPECT_EQ(parameter_uncertainty(report, 2).stddev, 0.2);
+  EXPECT_TRUE(parameter_uncertainty(report, 2).is_of_draws);
+  EXPECT_TRUE(std::isnan(parameter_correlation(report, 0, 2)));
+}
+
 }  // namespace
 }  // namespace gp2
