@@ -195,14 +195,16 @@ TEST(EvaluateJob, MeasuresByTheNoiseThatTheTestLogStates) {
 }
 
 TEST(EvaluateJob, WarnsOfIntervalsThatHoldFewOfTheValues) {
-  const FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx", false)}});
-  const CsvTable test = log_of("test.csv", 40, ",ddx", false);
+  const FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddy,ddheading", false)}});
+  EvaluateRequest request;
+  request.outputs = {"ddx"};
   const auto warned = Contains(HasSubstr("% of the values lie within their 95 % intervals"));
-  EXPECT_THAT(evaluate(fit.file, fit.posterior, test, {}).notes, Not(warned));
+  const CsvTable stated = log_of("test.csv", 40, ",ddx,ddx_std", false, "0.7"), test = log_of("test.csv", 40, ",ddx", false);
+  EXPECT_THAT(evaluate(fit.file, fit.posterior, stated, request).notes, Not(warned));
   ModelValues values = fit.posterior.values();
-  values.noise_stddev = {VectorXd::Constant(1, 1e-6)};
+  values.noise_stddev = {VectorXd::Constant(3, 1e-6)};
   const Posterior sure(fit.posterior.prior(), fit.posterior.observations(), values);
-  EXPECT_THAT(evaluate(fit.file, sure, test, {}).notes, warned);
+  EXPECT_THAT(evaluate(fit.file, sure, test, request).notes, warned);
 }
 
 TEST(EvaluateJob, TakesAFactorThatTrainingFoundForStatedNoise) {
