@@ -13,6 +13,7 @@
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
 #include "inference/problems.hpp"
+#include "io_testing.hpp"
 #include "jobs/data_of_model.hpp"
 #include "jobs/late_cart.hpp"
 #include "test_models.hpp"
@@ -451,7 +452,8 @@ TEST(Residuals, OfARobustFitLeaveOutWhatItDistrusts) {
   EXPECT_GE(outcome.file.report.distrusted.size(), 2U);
   EXPECT_LT(outcome.cross_validation->one_by_one.nrmse, 0.3);
   EXPECT_EQ(cross_validate(outcome.file, outcome.posterior).one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
-  const std::string path = testing::TempDir() + "robust_fit.json";
+  const test::TemporaryFolder folder;
+  const std::filesystem::path path = folder / "robust_fit.json";
   outcome.file.write(path);
   const FitFile read = FitFile::read(path);
   EXPECT_EQ(read.report.distrusted.size(), outcome.file.report.distrusted.size());

@@ -2,13 +2,11 @@
 
 #include <cmath>
 #include <filesystem>
-#include <fstream>
 #include <map>
 #include <tuple>
 
 #include <fmt/format.h>
 #include <gtest/gtest.h>
-#include <unistd.h>
 #include <Eigen/QR>
 
 #include "base/random.hpp"
@@ -16,6 +14,7 @@
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/model.hpp"
 #include "input_error.hpp"
+#include "io_testing.hpp"
 #include "robots/mujoco_oracle.hpp"
 
 namespace gp2 {
@@ -72,10 +71,8 @@ constexpr const char* tree = R"(<mujoco>
 
 // in a folder of this process: tests of one file run side by side
 std::filesystem::path written(const std::string& text, const char* name) {
-  const std::filesystem::path folder = std::filesystem::path(testing::TempDir()) / fmt::format("robots_{}", getpid());
-  std::filesystem::create_directories(folder);
-  std::ofstream(folder / name) << text;
-  return folder / name;
+  static const test::TemporaryFolder folder;
+  return folder.write(name, text);
 }
 
 std::filesystem::path source_path(const char* path) { return std::filesystem::path(GP2_SOURCE_DIR) / path; }

@@ -2,7 +2,6 @@
 
 #include <cmath>
 #include <filesystem>
-#include <fstream>
 #include <string>
 
 #include <fmt/format.h>
@@ -21,6 +20,7 @@
 #include "gp2/simulate.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "input_error.hpp"
+#include "io_testing.hpp"
 
 namespace gp2 {
 namespace {
@@ -118,9 +118,10 @@ hold = ['f_y', 'f_z', 'body("drone").rot_yz', 'body("drone").rot_xy']
 )";
 
 Model read_drone(const std::string& text) {
-  const std::filesystem::path path = std::filesystem::path(testing::TempDir()) / "drone.xml";
-  std::ofstream(path) << R"(<mujoco><worldbody><body name="drone" pos="0 0 1"><freejoint name="f"/>
-    <inertial pos="0.01 0 0.02" mass="1" fullinertia="0.01 0.011 0.02 0.001 0 0.002"/></body></worldbody></mujoco>)";
+  const test::TemporaryFolder folder;
+  const std::filesystem::path path =
+      folder.write("drone.xml", R"(<mujoco><worldbody><body name="drone" pos="0 0 1"><freejoint name="f"/>
+    <inertial pos="0.01 0 0.02" mass="1" fullinertia="0.01 0.011 0.02 0.001 0 0.002"/></body></worldbody></mujoco>)");
   return Model::parse(text, "drone", [&](const std::string&) { return read_robot(path); });
 }
 
@@ -196,8 +197,7 @@ Fit fit_of(const Model& model, FitProblem& problem, int n) {
 }
 
 TEST(RobotFit, IsReadBackWithoutTheRobotsFileAndPredictsTheSameBits) {
-  const std::filesystem::path folder = std::filesystem::path(testing::TempDir()) / "robot_fit";
-  std::filesystem::create_directories(folder);
+  const test::TemporaryFolder folder;
   for (const char* file : {"four_bar.toml", "four_bar.xml"}) {
     std::filesystem::copy_file(std::filesystem::path(GP2_SOURCE_DIR) / "models" / file, folder / file,
                                std::filesystem::copy_options::overwrite_existing);
