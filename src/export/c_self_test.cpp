@@ -122,8 +122,7 @@ void Writer::write_tests() {
       if (!(moved <= precision * largest + rounding)) {
         throw InputError(
             fmt::format("export to C: in single precision the states themselves are too coarse: rounding one of them moves the "
-                        "mean by {:.2g}. "
-                        "Let time and coordinates start near 0, or leave `float` out",
+                        "mean by {:.2g}. Let time and coordinates start near 0, or leave `float` out",
                         moved));
       }
     }

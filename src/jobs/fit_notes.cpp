@@ -484,4 +484,9 @@ void add_force_note(const Posterior& posterior, std::vector<std::string>& notes)
       gain));
 }
 
+void add_learned_note(const FitFile& fit, const CsvTable& log, std::vector<std::string>& notes) {
+  if (!log.file() || !fit.has_learned(*log.file())) return;
+  notes.push_back(fmt::format("{}: the fit has learned from this log: errors at new data are larger", log.name()));
+}
+
 }  // namespace gp2

@@ -83,4 +83,7 @@ std::optional<std::string> note_of_unlearnable_force(const Prior& prior);
 // Where they could: that the same data are far more likely with it under the same hyperparameters.
 void add_force_note(const Posterior& posterior, std::vector<std::string>& notes);
 
+// That a fit is scored on a log which it has learned from.
+void add_learned_note(const FitFile& fit, const CsvTable& log, std::vector<std::string>& notes);
+
 }  // namespace gp2

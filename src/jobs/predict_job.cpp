@@ -388,9 +388,7 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
                                            parameters_of(at.view, posterior.values().parameters));
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
-  if (log.file() && fit.has_learned(*log.file())) {
-    out.notes.push_back(fmt::format("{}: the fit has learned from this log: errors at new data are larger", name));
-  }
+  add_learned_note(fit, log, out.notes);
   log = CsvTable();
   EvaluationOptions options{at.view.other_system, {}, request.threads, stop};
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);

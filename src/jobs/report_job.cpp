@@ -9,7 +9,6 @@
 #include <fmt/chrono.h>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <nlohmann/json.hpp>
 
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
@@ -530,9 +529,9 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   report.notes = notes_of_fit(report.fit, posterior, report.cross_validation);
   report.relevance = relevance_of(posterior);
   report.learned = learned_forces(posterior);
-  if (request.data) report.data.push_back(compare(report.fit, posterior, request, notes));
-  if (request.data && request.data->file() && report.fit.has_learned(*request.data->file())) {
-    notes.push_back(fmt::format("{}: the fit has learned from this log: errors at new data are larger", request.data->name()));
+  if (request.data) {
+    report.data.push_back(compare(report.fit, posterior, request, notes));
+    add_learned_note(report.fit, *request.data, notes);
   }
   if (request.truth) add_truth(request, report);
   if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {

@@ -550,7 +550,8 @@ TEST(Residuals, TellOfInputsThatAreSwapped) {
 
 // A delay mends some of the misfit of nearly any wrong model.
 TEST(Residuals, BlameNoDelayForAWrongModel) {
-  const auto two_masses = [](const char* force_of_spring) {
+  const std::string smooth = "kernel = \"se + linear\"\n";
+  const auto two_masses = [](const char* force_of_spring, const std::string& kernel) {
     return Model::parse(fmt::format(R"toml(
 coordinates = ["x", "y"]
 inputs = ["u"]
@@ -559,20 +560,18 @@ mass = [["1.5", "0"], ["0", "0.7"]]
 force = ["u", "0"]
 [[latent]]
 name = "spring"
-kernel = "se + linear"
-features = ["x - y"]
-directions = {{ force = [["1"], ["{}"]] }}
+{0}features = ["x - y"]
+directions = {{ force = [["1"], ["{1}"]] }}
 [[latent]]
 name = "drag"
-kernel = "se + linear"
-features = ["dy"]
+{0}features = ["dy"]
 directions = {{ force = [["0"], ["1"]] }}
 [noise]
 ddq = 0.1
 [truth]
 force = ["-60*(x - y) - 0.5*dx", "60*(x - y) - 0.4*dy"]
 )toml",
-                                    force_of_spring),
+                                    kernel, force_of_spring),
                         "two_masses.toml");
   };
   SimulateRequest motion;
@@ -581,7 +580,7 @@ force = ["-60*(x - y) - 0.5*dx", "60*(x - y) - 0.4*dy"]
   const Eigen::VectorXd u = 9 * (5.2 * motion.times.array() + 1).sin() + 6 * (11.3 * motion.times.array()).sin();
   const auto column = [](const auto& row) { return std::vector<double>(row.begin(), row.end()); };
   motion.inputs = CsvTable::from_columns("commands", {{"t", column(motion.times)}, {"u", column(u)}});
-  const Model right = two_masses("-1"), wrong = two_masses("1");
+  const Model right = two_masses("-1", smooth), wrong = two_masses("1", smooth);
   const Trajectory run = run_simulation(prepare_simulation(right, motion)).front();
   RandomStream random(61);
   Eigen::MatrixXd ddq = run.accelerations;
@@ -594,11 +593,15 @@ force = ["-60*(x - y) - 0.5*dx", "60*(x - y) - 0.4*dy"]
                                                       {"ddx", column(ddq.row(0))},
                                                       {"ddy", column(ddq.row(1))},
                                                       {"u", column(u)}});
-  const auto notes_under = [&](const Model& model) {
-    return notes_of(run_fit(prepare_fit(fit_request(model, {log}))).notes, "the input u");
+  const auto notes_under = [&](const Model& model, const char* about = "the input u") {
+    return notes_of(run_fit(prepare_fit(fit_request(model, {log}))).notes, about);
   };
   EXPECT_THAT(notes_under(right), testing::IsEmpty());
   EXPECT_THAT(notes_under(wrong), testing::ElementsAre(HasSubstr("the model does not explain what the input u does")));
+  // a rough kernel follows single rows, and is denied by stretches
+  EXPECT_THAT(notes_under(two_masses("1", ""), ""),
+              testing::AllOf(Contains(HasSubstr("warning: the fit predicts unseen stretches")),
+                             Not(Contains(HasSubstr("later than logged")))));
 }
 
 TEST(Residuals, NameSingleValuesOfAnInput) {
