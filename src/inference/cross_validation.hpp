@@ -21,7 +21,7 @@ inline bool is_little_predicted(const Evaluation::Part& left_out, double nrmse_o
 }
 
 /// cross_validate by some of the values.
-/// @param judged  the observations of the posterior; of values that do not count NaN
-CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& judged, bool has_time_order);
+/// @param trusted  the observations of the posterior; of values that do not count NaN
+CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& trusted, bool has_time_order);
 
 }  // namespace gp2

@@ -242,13 +242,13 @@ bool TrainingResidual::is_correlated() const {
 
 namespace {
 
-std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<Observations>& judged,
+std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<Observations>& trusted,
                                                  const std::vector<LeaveOneOut>& left_out) {
   // of many states some are left, which do not follow each other
   const bool are_all = posterior.n_states() == n_states(posterior.observations());
   std::vector<TrainingResidual> residuals;
   for (std::size_t g = 0; g < left_out.size(); ++g) {
-    const Observations& group = judged[g];
+    const Observations& group = trusted[g];
     const Prior& prior = prior_of(posterior.prior(), group.view());
     const std::vector<std::string> names = group.view().names(*prior.system, latent_name(prior, group.view()));
     const VectorXd noise = posterior.noise_stddev(g);
@@ -293,19 +293,19 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
 
 // Of the measured values, row by row over all observations: add(scores, row, group number, row of its view, state).
 template <typename Add>
-Evaluation::Part scores_of(const std::vector<Observations>& judged, const Observed& of, const Add& add) {
-  const std::vector<int> rows = rows_of(judged, of);
+Evaluation::Part scores_of(const std::vector<Observations>& trusted, const Observed& of, const Add& add) {
+  const std::vector<int> rows = rows_of(trusted, of);
   Scores scores(std::ssize(rows));
   VectorXd spread(std::ssize(rows));
   for (Index r = 0; r < spread.size(); ++r) {
-    spread[r] = training_spread(judged, of, rows[static_cast<std::size_t>(r)]);
-    for_each_observed(judged, of, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
-      for (Index i = 0; i < judged[g].n_data(); ++i) {
-        if (!std::isnan(judged[g].values()(k, i))) add(scores, r, g, k, i);
+    spread[r] = training_spread(trusted, of, rows[static_cast<std::size_t>(r)]);
+    for_each_observed(trusted, of, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
+      for (Index i = 0; i < trusted[g].n_data(); ++i) {
+        if (!std::isnan(trusted[g].values()(k, i))) add(scores, r, g, k, i);
       }
     });
   }
-  for (const Observations& group : judged) scores.n += of.has(group.view()) ? group.n_data() : 0;
+  for (const Observations& group : trusted) scores.n += of.has(group.view()) ? group.n_data() : 0;
   return scores.part(spread.norm());
 }
 
@@ -318,13 +318,13 @@ std::vector<MatrixXd> noise_of_groups(const Posterior& posterior) {
   return noise;
 }
 
-LeftOutScores scores_of(const Posterior& posterior, const std::vector<Observations>& judged, const LeftOut& left_out,
+LeftOutScores scores_of(const Posterior& posterior, const std::vector<Observations>& trusted, const LeftOut& left_out,
                         const Observed& of) {
   std::vector<MatrixXd> noise = noise_of_groups(posterior);
   const auto part_of = [&](const std::vector<LeaveOneOut>& predicted) {
-    return scores_of(judged, of, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
+    return scores_of(trusted, of, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
       if (std::isnan(predicted[g].mean(k, i))) return;  // double precision cannot tell
-      scores.add(r, judged[g].values()(k, i) - predicted[g].mean(k, i), std::sqrt(predicted[g].variance(k, i)), noise[g](k, i),
+      scores.add(r, trusted[g].values()(k, i) - predicted[g].mean(k, i), std::sqrt(predicted[g].variance(k, i)), noise[g](k, i),
                  /*has_variance=*/false);
     });
   };
@@ -341,7 +341,7 @@ LeftOutScores scores_of(const Posterior& posterior, const std::vector<Observatio
   const auto add_noise = [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
     scores.add(r, noise[g](k, i), 0, not_a_number, /*has_variance=*/false);
   };
-  out.nrmse_of_noise = scores_of(judged, of, add_noise).nrmse;
+  out.nrmse_of_noise = scores_of(trusted, of, add_noise).nrmse;
   return out;
 }
 
@@ -368,15 +368,15 @@ bool has_stretches(const Posterior& posterior, bool has_time_order) {
 
 }  // namespace
 
-CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& judged, bool has_time_order) {
-  if (judged.empty()) throw InputError("cross_validate: the posterior has no observations to leave out");
+CrossValidation cross_validate(const Posterior& posterior, const std::vector<Observations>& trusted, bool has_time_order) {
+  if (trusted.empty()) throw InputError("cross_validate: the posterior has no observations to leave out");
   const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
   std::vector<LeftOutScores> of_views;
-  for (const Observed& of : observed_views(judged)) of_views.push_back(scores_of(posterior, judged, left_out, of));
+  for (const Observed& of : observed_views(trusted)) of_views.push_back(scores_of(posterior, trusted, left_out, of));
   CrossValidation out;
   if (!of_views.empty()) static_cast<LeftOutScores&>(out) = of_views.front();
   out.other_views.assign(of_views.begin() + (of_views.empty() ? 0 : 1), of_views.end());
-  out.residuals = training_residuals(posterior, judged, left_out.values);
+  out.residuals = training_residuals(posterior, trusted, left_out.values);
   return out;
 }
 

@@ -225,25 +225,24 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   return job;
 }
 
-// What to judge a fit by: of a robust one without the values that it distrusts, which are no measure of its predictions. Of many states
-// every k-th is kept, whose numbers and lines are those of the log.
-JudgedData judged_data(const Posterior& posterior, const FitReport& report, const std::vector<std::vector<int>>& lines = {}) {
-  JudgedData judged{posterior.observations(), {}};
+// Of many states every k-th is kept; their numbers and lines are those of the log.
+TrustedData trusted_data(const Posterior& posterior, const FitReport& report, const std::vector<std::vector<int>>& lines = {}) {
+  TrustedData trusted{posterior.observations(), {}};
   const std::shared_ptr<const InducingSummary> summary = posterior.summary();
   const int step = summary ? summary->kept.step : 1;
   for (const std::vector<int>& of_log : lines) {
-    std::vector<int>& kept = judged.lines.emplace_back();
+    std::vector<int>& kept = trusted.lines.emplace_back();
     for (std::size_t i = 0; i < of_log.size(); i += static_cast<std::size_t>(step)) kept.push_back(of_log[i]);
   }
-  for (std::size_t g = 0; g < judged.observations.size(); ++g) {
-    Eigen::MatrixXd values = judged.observations[g].values();
+  for (std::size_t g = 0; g < trusted.observations.size(); ++g) {
+    Eigen::MatrixXd values = trusted.observations[g].values();
     for (const DistrustedValue& one : report.distrusted) {
       const bool is_kept = one.group == static_cast<int>(g) && one.state % step == 0 && one.state / step < values.cols();
       if (is_kept) values(one.row, one.state / step) = not_a_number;
     }
-    if (!report.distrusted.empty()) judged.observations[g] = judged.observations[g].with_values(std::move(values));
+    if (!report.distrusted.empty()) trusted.observations[g] = trusted.observations[g].with_values(std::move(values));
   }
-  return judged;
+  return trusted;
 }
 
 // What residuals say of how many rows are worth one measurement.
@@ -337,16 +336,16 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   std::vector<std::string>& notes = outcome.notes;
   std::optional<CrossValidation>& scores = outcome.cross_validation;
   const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
-  const JudgedData judged = judged_data(posterior, report, job.problem.lines);
+  const TrustedData trusted = trusted_data(posterior, report, job.problem.lines);
   Tests tests;
   tests.run("the use of the known force", [&] { add_force_note(posterior, notes); });
   tests.run("the constraints", [&] { add_constraint_note(posterior, notes); });
   tests.run("the windows", [&] { add_window_note(posterior, notes); });
-  tests.run("the values left out", [&] { scores = cross_validate(posterior, judged.observations, has_row_order); });
+  tests.run("the values left out", [&] { scores = cross_validate(posterior, trusted.observations, has_row_order); });
   if (scores && report.inducing) report.inducing->stretches = scores->stretches;
   if (report.iterations > 0) tests.run("the noise", [&] { add_noise_notes(posterior, notes); });
-  if (scores) tests.run("the residuals", [&] { add_residual_notes(posterior, judged, scores->residuals, notes); });
-  tests.run("values at the ends of a range", [&] { add_pile_up_notes(judged.observations, *posterior.prior().system, notes); });
+  if (scores) tests.run("the residuals", [&] { add_residual_notes(posterior, trusted, scores->residuals, notes); });
+  tests.run("values at the ends of a range", [&] { add_pile_up_notes(trusted.observations, *posterior.prior().system, notes); });
   if (scores) tests.run("the stretches", [&] { add_stretch_note(*scores, notes, posterior.prior()); });
   FitOptions quick;
   quick.n_restarts = 1;
@@ -359,7 +358,7 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
     return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
   };
   tests.run("the inputs and the logs",
-            [&] { add_doubts(posterior, judged.lines, has_row_order, held_parameters(report), fitted_values, notes); });
+            [&] { add_doubts(posterior, trusted.lines, has_row_order, held_parameters(report), fitted_values, notes); });
   const std::string correlated = scores ? correlated_text(scores->residuals) : "";
   if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: standard deviations are too small", correlated));
   tests.add_notes(notes);
@@ -503,13 +502,13 @@ FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<vo
     all = run_once(job, progress, stop);
     if (!all->cross_validation) return *all;
     const Worth worth(all->cross_validation->residuals, job.problem.observations);
-    const JudgedData judged = judged_data(all->posterior, all->file.report, job.problem.lines);
+    const TrustedData trusted = trusted_data(all->posterior, all->file.report, job.problem.lines);
     // that a constraint does not hold is no error that lasts
-    if (!worth.is_less() || denies_constraints(all->posterior, judged)) return *all;
+    if (!worth.is_less() || denies_constraints(all->posterior, trusted)) return *all;
     FitOutcome fewer = run_thinned(job, worth, progress, stop);
     if (fewer.file.report.termination == FitReport::interrupted) return *all;
     std::vector<std::string> notes;
-    add_residual_notes(all->posterior, judged, all->cross_validation->residuals, notes);
+    add_residual_notes(all->posterior, trusted, all->cross_validation->residuals, notes);
     take_notes_of_all(std::move(notes), fewer.notes);
     return fewer;
   } catch (const Error& error) {
@@ -716,7 +715,7 @@ FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
 
 CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
   CrossValidation scores =
-      cross_validate(posterior, judged_data(posterior, fit.report).observations, keeps_row_order(fit, fit.n_states()));
+      cross_validate(posterior, trusted_data(posterior, fit.report).observations, keeps_row_order(fit, fit.n_states()));
   if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
   return scores;
 }

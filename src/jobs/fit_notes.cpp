@@ -106,8 +106,9 @@ namespace {
 
 // The accelerations of a group against A ddq = b. An estimated noise takes up what denies a constraint: beside it they are judged by
 // the terms that should cancel, as where no noise is known. A row of one term alone has nothing to cancel, and a soft one need not.
-std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, const JudgedData& judged, std::size_t group) {
-  const Observations& of = judged.observations[group];
+std::vector<ConstraintResidual> residuals_against_constraints(const Posterior& posterior, const TrustedData& trusted,
+                                                              std::size_t group) {
+  const Observations& of = trusted.observations[group];
   const Prior& prior = prior_of(posterior.prior(), of.view());
   const MatrixXd noise = of.noise().of_values(posterior.noise_stddev(group), of.n_data());
   std::vector<ConstraintResidual> residuals =
@@ -121,14 +122,14 @@ std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, c
 }
 
 // The accelerations of each log against the constraints.
-void add_constraint_residual_notes(const Posterior& posterior, const JudgedData& judged, std::vector<std::string>& notes) {
-  for (std::size_t g = 0; g < judged.observations.size(); ++g) {
-    if (!judged.observations[g].view().is_of_ddq()) continue;
-    for (ConstraintResidual& one : residuals_to_judge(posterior, judged, g)) {
+void add_constraint_residual_notes(const Posterior& posterior, const TrustedData& trusted, std::vector<std::string>& notes) {
+  for (std::size_t g = 0; g < trusted.observations.size(); ++g) {
+    if (!trusted.observations[g].view().is_of_ddq()) continue;
+    for (ConstraintResidual& one : residuals_against_constraints(posterior, trusted, g)) {
       if (!one.is_too_large()) continue;
       for (int& state : one.worst) {  // numbers of rows below the header
         const auto at = static_cast<std::size_t>(state);
-        if (g < judged.lines.size() && at < judged.lines[g].size()) state = judged.lines[g][at] - 2;
+        if (g < trusted.lines.size() && at < trusted.lines[g].size()) state = trusted.lines[g][at] - 2;
       }
       notes.push_back("warning: " + one.text());
     }
@@ -136,7 +137,7 @@ void add_constraint_residual_notes(const Posterior& posterior, const JudgedData&
 }
 
 // Single values that are far off; those of columns of which many are not counted.
-void add_far_value_note(const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
+void add_far_value_note(const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
   constexpr double much = 3;  // times the noise, or what the fit is sure of
   const TrainingResidual* farthest = nullptr;
@@ -148,9 +149,9 @@ void add_far_value_note(const JudgedData& judged, const std::vector<TrainingResi
   }
   if (farthest == nullptr) return;
   const std::string where = farthest->farthest_state < 0 ? ""
-                                                         : ", in " + place_of(judged.lines, farthest->group,
+                                                         : ", in " + place_of(trusted.lines, farthest->group,
                                                                               static_cast<std::size_t>(farthest->farthest_state),
-                                                                              judged.observations.size() == 1);
+                                                                              trusted.observations.size() == 1);
   const bool is_open = farthest->rms_in_noise > much * std::max(1.0, farthest->rms);
   notes.push_back(fmt::format(
       "warning: {} of the values lie six or more standard deviations from their prediction by all others, up to {:.2g} ({}{}): "
@@ -181,20 +182,20 @@ std::vector<std::string> constraint_warnings(const Posterior& posterior, const s
   return warnings;
 }
 
-bool denies_constraints(const Posterior& posterior, const JudgedData& judged) {
-  for (std::size_t g = 0; g < judged.observations.size(); ++g) {
-    if (!judged.observations[g].view().is_of_ddq()) continue;
-    if (std::ranges::any_of(residuals_to_judge(posterior, judged, g), &ConstraintResidual::is_too_large)) return true;
+bool denies_constraints(const Posterior& posterior, const TrustedData& trusted) {
+  for (std::size_t g = 0; g < trusted.observations.size(); ++g) {
+    if (!trusted.observations[g].view().is_of_ddq()) continue;
+    if (std::ranges::any_of(residuals_against_constraints(posterior, trusted, g), &ConstraintResidual::is_too_large)) return true;
   }
   return false;
 }
 
-void add_residual_notes(const Posterior& posterior, const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
+void add_residual_notes(const Posterior& posterior, const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
-  add_constraint_residual_notes(posterior, judged, notes);
+  add_constraint_residual_notes(posterior, trusted, notes);
   std::vector<std::string> large, small;
   for (const TrainingResidual& one : residuals) {
-    const Observations& group = judged.observations[one.group];
+    const Observations& group = trusted.observations[one.group];
     if (one.is_too_small() && !group.noise().is_estimated() && !group.has_sums() && !has_dependent_columns(posterior, group))
       small.push_back(fmt::format("{} ({:.2g} of the noise)", one.output, one.rms_in_noise));
     if (one.is_too_large())
@@ -207,7 +208,7 @@ void add_residual_notes(const Posterior& posterior, const JudgedData& judged, co
                     "something; see gp2 check and gp2 report",
                     fmt::join(large, ", ")));
   }
-  add_far_value_note(judged, residuals, notes);
+  add_far_value_note(trusted, residuals, notes);
   if (small.empty()) return;
   notes.push_back(
       fmt::format("values lie closer to their prediction by all others than the stated noise allows: {}: it is stated too large, "

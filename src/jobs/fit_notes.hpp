@@ -25,8 +25,8 @@ std::string place_of(const std::vector<std::vector<int>>& lines, std::size_t gro
 // Which measured values lie so far from all others that a fit may fail for them; empty where none do, or many.
 std::string gross_errors_text(const FitProblem& problem);
 
-// What a fit is judged by.
-struct JudgedData {
+// The observations of a fit without the values that it distrusts, which are no measure of its predictions.
+struct TrustedData {
   std::vector<Observations> observations;    // of the posterior, NaN where a robust fit distrusts a value
   std::vector<std::vector<int>> lines = {};  // as place_of
 };
@@ -41,10 +41,10 @@ std::vector<std::string> constraint_warnings(const Posterior& posterior, const s
                                              const Eigen::MatrixXd& measured, const Eigen::MatrixXd& noise_stddev);
 
 // Whether measured accelerations do not obey the constraints.
-bool denies_constraints(const Posterior& posterior, const JudgedData& judged);
+bool denies_constraints(const Posterior& posterior, const TrustedData& trusted);
 
 // What the residuals say against the data, the constraints or the noise.
-void add_residual_notes(const Posterior& posterior, const JudgedData& judged, const std::vector<TrainingResidual>& residuals,
+void add_residual_notes(const Posterior& posterior, const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes);
 
 // Whether the fit says little of what it has not seen, or less than the noise lets it.

@@ -59,7 +59,7 @@ class GradientColumns {
   /// cov(g(φ_i), f(φ')) for every point, but for a constant of each point, to w.out (n × D).
   void of_function(Workspace& w) const;
 
-  /// The variance of f(φ) − f(φ'), without cancellation.
+  /// The variance of f(φ) − f(φ'), to a relative error of ε where 2 k(0) − 2 k would cancel; of matern52 6 ε/r, r = √5 ‖φ − φ'‖/ℓ.
   /// @param difference  φ − φ' (D)
   [[nodiscard]] double variance_of_difference(const Eigen::Ref<const Eigen::VectorXd>& difference) const;
 
