@@ -165,14 +165,14 @@ const SymbolicSystem& require_symbolic_system(const Model& model);
 /// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
 Prior make_prior(const Model& model, const PriorOptions& options = {});
 
-/// The actuators of `other`: a delay or lag that it marks `estimate = true` is that of the same input of `home`.
-std::vector<Actuator> shared_actuators(const std::vector<Actuator>& home, const Model& other);
+/// The actuators of `other`: a delay or lag that it marks `estimate = true` is that of the same input of `fitted`.
+std::vector<Actuator> shared_actuators(const std::vector<Actuator>& fitted, const Model& other);
 
-/// The system of `other` for the latents of `home` to act in. A parameter that `other` marks `estimate = true` and `home` has
+/// The system of `other` for the latents of `fitted` to act in. A parameter that `other` marks `estimate = true` and `fitted` has
 /// by the same name is one and the same; every other keeps the value of its own file.
-/// @param options  those of the prior at home
+/// @param options  those of the prior of `fitted`
 /// @throws InputError naming what differs: coordinates, inputs, the number of latents, or a latent's kernel, features or
 ///   directions; and when a parameter that is one and the same stands in a feature of `other`.
-std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const PriorOptions& options = {});
+std::shared_ptr<const OtherSystem> make_other_system(const Model& fitted, const Model& other, const PriorOptions& options = {});
 
 }  // namespace gp2

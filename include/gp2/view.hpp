@@ -17,11 +17,11 @@ namespace gp2 GP2_API {
 /// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
 /// inputs (Geist & Trimpe 2020, eq. 10).
 struct OtherSystem {
-  Prior prior;              // as many latents as the prior at home, with the same kernels, features and numbers of directions
-  std::vector<int> shared;  // per parameter of its system: which parameter at home it is; −1: it has its own value
+  Prior prior;              // as many latents as the fitted prior, with the same kernels, features and numbers of directions
+  std::vector<int> shared;  // per parameter of its system: which parameter of the fitted system it is; −1: it has its own value
 
-  /// The parameters there, given those at home.
-  [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& home) const;
+  /// The parameters there, given those of the fitted system.
+  [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& fitted) const;
 };
 
 /// Latents of a prior that follow each other: one, or those that one [[latent]] with lengthscales of its own for each direction
@@ -84,20 +84,20 @@ bool reads_loads(const Prior& prior);
 
 /// A view as it is under A ddq = b + push.
 /// @param push  (nc), 0 of rows that are not there
-View pushed(const Prior& home, View view, const Eigen::VectorXd& push);
+View pushed(const Prior& fitted, View view, const Eigen::VectorXd& push);
 
-/// What a view looks at: the prior of its other system, or the one at home; and the parameters there.
-const Prior& prior_of(const Prior& home, const View& view);
-Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);
+/// What a view looks at: the prior of its other system, or the fitted one; and the parameters there.
+const Prior& prior_of(const Prior& fitted, const View& view);
+Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& fitted);
 
 /// @throws InputError when a prior cannot be viewed so: there are no such rows or no such latent, none are named, the time step is
 /// missing or not positive, or the other system has other latents, coordinates or parameters.
-void require_view(const Prior& home, const View& view);
+void require_view(const Prior& fitted, const View& view);
 
 /// The mechanics at N states for a view of a prior: as evaluate_mechanics of the system, and a fault also where M is singular, so
 /// that there is no ā, while the view is of ā, the prior's mean constant, or a latent not on forces.
 ///
-/// @param prior       prior_of(home, view)
+/// @param prior       prior_of(fitted, view)
 /// @param parameters  of its system
 void evaluate_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
                         const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);

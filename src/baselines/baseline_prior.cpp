@@ -39,13 +39,13 @@ void require_size(const Eigen::VectorXd& values, std::size_t size, const char* w
 // What a baseline's latents are made of: the features of the model's latents, each once, and every entry of the state that the
 // mechanics read and no latent does. What a latent need not learn a baseline must.
 struct Parts {
-  std::shared_ptr<const System> home;
+  std::shared_ptr<const System> fitted;
   PriorWords words;
   std::vector<std::string> names;
   std::vector<Expression> raw;
   std::size_t n_of_latents = 0;
 
-  explicit Parts(const Model& model) : home(model.system), words(prior_words(model)) {
+  explicit Parts(const Model& model) : fitted(model.system), words(prior_words(model)) {
     for (const LatentSpec& latent : model.latents) {
       if (latent.feature_code) {
         throw InputError(fmt::format("{}: a baseline needs features as expressions, but those of the latent '{}' are code",
@@ -85,7 +85,7 @@ struct Parts {
     Latent latent;
     latent.name = std::move(name);
     latent.feature_names = names;
-    latent.features = ExpressionFunction::of_state(features, words.symbols, home);
+    latent.features = ExpressionFunction::of_state(features, words.symbols, fitted);
     latent.kernel = Kernel::parse(kernel, latent.feature_names);
     return latent;
   }
@@ -179,14 +179,14 @@ Prior make_prior(const Model& model, const FitPriorOptions& options) {
   return make_prior(model, static_cast<const PriorOptions&>(options));
 }
 
-std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const FitPriorOptions& options) {
-  if (!options.baseline) return make_other_system(home, other, static_cast<const PriorOptions&>(options));
-  // means and deviations are of the features at home: first see whether they are the same there
+std::shared_ptr<const OtherSystem> make_other_system(const Model& fitted, const Model& other, const FitPriorOptions& options) {
+  if (!options.baseline) return make_other_system(fitted, other, static_cast<const PriorOptions&>(options));
+  // means and deviations are of the features of the fitted system: first see whether they are the same there
   const auto unscaled = [&](const Model& model) {
     return make_baseline_prior(model, unstandardised(model, options.baseline->kind));
   };
-  require_same_latents(home, unscaled(home), other, unscaled(other));
-  return share_parameters(home, make_baseline_prior(home, *options.baseline), other,
+  require_same_latents(fitted, unscaled(fitted), other, unscaled(other));
+  return share_parameters(fitted, make_baseline_prior(fitted, *options.baseline), other,
                           make_baseline_prior(other, *options.baseline));
 }
 

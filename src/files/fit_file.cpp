@@ -91,10 +91,10 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["library"] = version();
   json["model"] = model_json(model);
   json["prior"] = prior_json(prior_options);
-  const Prior home = prior();
-  require_observations(home, observations);
-  require_hyperparameters(home, observations, report.hyperparameters);
-  json["hyperparameters"] = hyperparameters_json(report.hyperparameters, home);
+  const Prior fitted = prior();
+  require_observations(fitted, observations);
+  require_hyperparameters(fitted, observations, report.hyperparameters);
+  json["hyperparameters"] = hyperparameters_json(report.hyperparameters, fitted);
   json["report"] = report_json(report);
   if (notes) json["report"]["notes"] = *notes;
   if (!report.actuators.empty()) json["actuators"] = actuators_json(report.actuators);
@@ -117,7 +117,7 @@ void FitFile::write(const std::filesystem::path& path) const {
                       "least (a larger window), or fit anew to the others",
                       path.string(), g + 1, (other != nullptr ? *other : model).name));
     }
-    json["observations"].push_back(observations_json(observations[g], home, other));
+    json["observations"].push_back(observations_json(observations[g], fitted, other));
   }
   json["checksum"] = checksum_of(ParsedJson(json));
   // a path in `data_source` may hold bytes that are no text

@@ -25,8 +25,8 @@ void locate_in_model(std::vector<Hyperparameter>& hyperparameters, const Prior& 
 
 // observations_json.cpp
 /// @param other  the model of its view's other system; null: none
-Json observations_json(const Observations& group, const Prior& home, const Model* other);
-Observations observations_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system);
+Json observations_json(const Observations& group, const Prior& fitted, const Model* other);
+Observations observations_from(const ParsedJson& json, const Prior& fitted, std::shared_ptr<const OtherSystem> other_system);
 Json logs_json(const std::vector<LogFile>& logs);
 std::vector<LogFile> logs_from(const ParsedJson& json);
 

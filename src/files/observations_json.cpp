@@ -19,10 +19,10 @@ Json states_json(const MatrixXd& states, const std::vector<std::string>& names) 
   return json;
 }
 
-View view_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system) {
+View view_from(const ParsedJson& json, const Prior& fitted, std::shared_ptr<const OtherSystem> other_system) {
   View view;
   view.other_system = std::move(other_system);
-  const Prior& prior = prior_of(home, view);
+  const Prior& prior = prior_of(fitted, view);
   const auto word = json.at("view").get<std::string>();
   const std::optional<View::Quantity> quantity = View::Quantity::of_word(word);
   if (!quantity) throw InputError(fmt::format("'{}' is no view", word));
@@ -50,8 +50,8 @@ View view_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const 
 
 }  // namespace
 
-Json observations_json(const Observations& group, const Prior& home, const Model* other) {
-  const System& system = *prior_of(home, group.view()).system;
+Json observations_json(const Observations& group, const Prior& fitted, const Model* other) {
+  const System& system = *prior_of(fitted, group.view()).system;
   Json json = {{"view", group.view().quantity->word()},
                {"rows", group.view().rows},
                {"time_step", group.view().time_step.value_or(0)},
@@ -74,9 +74,9 @@ Json observations_json(const Observations& group, const Prior& home, const Model
   return json;
 }
 
-Observations observations_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system) {
-  View view = view_from(json, home, std::move(other_system));
-  const Prior& prior = prior_of(home, view);
+Observations observations_from(const ParsedJson& json, const Prior& fitted, std::shared_ptr<const OtherSystem> other_system) {
+  View view = view_from(json, fitted, std::move(other_system));
+  const Prior& prior = prior_of(fitted, view);
   const System& system = *prior.system;
   const int n = integer(json.at("n"));
   if (n < 1) throw InputError(fmt::format("{} observations are not possible", n));

@@ -17,7 +17,7 @@ using Eigen::VectorXd;
 
 namespace {
 
-// which parameter of the viewed system the one at home is, −1: none
+// which parameter of the viewed system the fitted system's is, −1: none
 int index_there(const View& view, int parameter) {
   if (!view.other_system) return parameter;
   const std::vector<int>& shared = view.other_system->shared;

@@ -77,7 +77,7 @@ FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& log
 }
 
 // which parameters the systems have in common is decided by other files: worth a word
-void note_parameters(const Model& home, const LoggedSystem& logged, const std::vector<std::string>& estimated,
+void note_parameters(const Model& fitted, const LoggedSystem& logged, const std::vector<std::string>& estimated,
                      std::vector<std::string>& notes) {
   if (!logged.other_system) return;
   const std::vector<Parameter>& parameters = logged.system().parameters();
@@ -85,14 +85,14 @@ void note_parameters(const Model& home, const LoggedSystem& logged, const std::v
     const std::string& name = parameters[k].name;
     if (parameters[k].estimate && logged.other_system->shared[k] < 0) {
       notes.push_back(fmt::format("{}: parameter '{}' is marked estimate = true, but '{}' has none of that name: it stays {}",
-                                  logged.model.name, name, home.name, parameters[k].value));
+                                  logged.model.name, name, fitted.name, parameters[k].value));
     }
     const bool tuned = std::find(estimated.begin(), estimated.end(), name) != estimated.end();
     if (tuned && logged.other_system->shared[k] < 0) {
       notes.push_back(
           fmt::format("{}: parameter '{}' stays {} there while it is estimated in '{}'; mark it estimate = true "
                       "there if it is one and the same",
-                      logged.model.name, name, parameters[k].value, home.name));
+                      logged.model.name, name, parameters[k].value, fitted.name));
     }
   }
 }

@@ -133,14 +133,14 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
 
 void add_truth(const ReportRequest& request, Report& report) {
   const Model& truth = *request.truth;
-  const System& home = *report.fit.model.system;
+  const System& fitted = *report.fit.model.system;
   if (truth.truth.empty()) {
     throw InputError(
         fmt::format("`truth={}`: has no [truth]; give a model file that says what the true acceleration is", truth.name));
   }
-  if (truth.system->state_names() != home.state_names()) {
+  if (truth.system->state_names() != fitted.state_names()) {
     throw InputError(fmt::format("`truth={}`: its state is {}, that of the fit is {}; coordinates and inputs must be the same",
-                                 truth.name, fmt::join(truth.system->state_names(), " "), fmt::join(home.state_names(), " ")));
+                                 truth.name, fmt::join(truth.system->state_names(), " "), fmt::join(fitted.state_names(), " ")));
   }
   const ModelMotion motion(truth);
   bool any = false;
@@ -264,10 +264,10 @@ void move_largest(std::vector<LearnedForce>& some, std::vector<LearnedForce>& al
 std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
   constexpr Index n_points = 101;
   const Prior& prior = posterior.prior();
-  const auto home = std::ranges::find_if(
+  const auto own = std::ranges::find_if(
       posterior.observations(), [](const Observations& group) { return !group.view().other_system && group.n_data() > 0; });
-  if (prior.reference || home == posterior.observations().end()) return {};
-  const MatrixXd& states = home->states();
+  if (prior.reference || own == posterior.observations().end()) return {};
+  const MatrixXd& states = own->states();
   const VectorXd usual = usual_state(prior, states);
   const std::vector<std::string> entries = prior.system->state_names();
   const bool has_several = std::ranges::any_of(

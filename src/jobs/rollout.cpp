@@ -151,8 +151,8 @@ class Roll {
 
   void run(const MatrixXd& states, const std::vector<std::string>& episodes, Rollout& out) {
     const StateLayout layout = system_.layout();
-    const VectorXd& at_home = posterior_.values().parameters;
-    const VectorXd parameters = asked_.other_system ? asked_.other_system->parameters(at_home) : at_home;
+    const VectorXd& fitted = posterior_.values().parameters;
+    const VectorXd parameters = asked_.other_system ? asked_.other_system->parameters(fitted) : fitted;
     const std::vector<Contact> contacts = contacts_of(*asked_.model, parameters);
     if (const std::vector<std::string> missing = missing_entries(system_, contacts, states); !missing.empty()) {
       out.reason = fmt::format("the data lack {}", fmt::join(missing, ", "));

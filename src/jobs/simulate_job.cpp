@@ -329,8 +329,8 @@ MotionEnergy mixed(const std::vector<MotionEnergy>& components) {
 
 SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request) {
   const Model& model = *system.model;
-  const auto parameters_of = [&](const VectorXd& at_home) -> VectorXd {
-    return system.other_system ? system.other_system->parameters(at_home) : at_home;
+  const auto parameters_of = [&](const VectorXd& fitted) -> VectorXd {
+    return system.other_system ? system.other_system->parameters(fitted) : fitted;
   };
   const VectorXd likeliest = parameters_of(posterior.values().parameters);
   SimulateJob job = prepare(model, system.actuators, likeliest, request);

@@ -298,12 +298,12 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   }
   const System& system = *posterior.prior().system;
   const std::vector<Observations>& groups = posterior.observations();
-  const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
+  const auto own = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
     return group.view().is_of_ddq() && group.view().other_system == nullptr;
   });
   View view = View::constrained_acceleration(system);
   std::vector<std::string> names = request.observe;
-  if (names.empty() && at_home != groups.end()) names = at_home->view().names(system);
+  if (names.empty() && own != groups.end()) names = own->view().names(system);
   view.rows = acceleration_rows(system, names, "`observe`");
   if (names.empty()) names = view.names(system);
   const bool projects = !fit.options.empty() && request_of(fit).problem.project;

@@ -28,19 +28,19 @@ void require_rows(const View& view, int nq, int nc) {
   }
 }
 
-// that the latents at home can act there
-void require_other_system(const Prior& home, const OtherSystem& other) {
+// that the latents of the fitted system can act there
+void require_other_system(const Prior& fitted, const OtherSystem& other) {
   const auto differ = [](const char* what, auto there, auto here) {
-    throw InputError(fmt::format("view: its other system has {} {}, that at home {}; make_other_system makes one that fits",
+    throw InputError(fmt::format("view: its other system has {} {}, the fitted one {}; make_other_system makes one that fits",
                                  there, what, here));
   };
   require_prior(other.prior);
-  const System &there = *other.prior.system, &here = *home.system;
+  const System &there = *other.prior.system, &here = *fitted.system;
   if (there.nq() != here.nq()) differ("coordinates", there.nq(), here.nq());
   if (there.layout().nu != here.layout().nu) differ("inputs", there.layout().nu, here.layout().nu);
-  if (other.prior.latents.size() != home.latents.size()) differ("latents", other.prior.latents.size(), home.latents.size());
-  for (std::size_t a = 0; a < home.latents.size(); ++a) {
-    const Latent &mine = home.latents[a], &its = other.prior.latents[a];
+  if (other.prior.latents.size() != fitted.latents.size()) differ("latents", other.prior.latents.size(), fitted.latents.size());
+  for (std::size_t a = 0; a < fitted.latents.size(); ++a) {
+    const Latent &mine = fitted.latents[a], &its = other.prior.latents[a];
     const auto kernel = [](const Latent& latent) {
       std::string text = latent.kernel.text();
       std::erase(text, ' ');
@@ -49,7 +49,7 @@ void require_other_system(const Prior& home, const OtherSystem& other) {
     if (kernel(its) != kernel(mine) || its.n_features() != mine.n_features() || its.size() != mine.size() ||
         its.n_functions() != mine.n_functions() || its.is_positive != mine.is_positive || its.is_potential != mine.is_potential) {
       throw InputError(
-          fmt::format("view: the latent '{}' of its other system is of another kind than '{}' at home; "
+          fmt::format("view: the latent '{}' of its other system is of another kind than '{}' of the fitted one; "
                       "make_other_system makes one that fits",
                       its.name, mine.name));
     }
@@ -65,15 +65,15 @@ void require_other_system(const Prior& home, const OtherSystem& other) {
 
 }  // namespace
 
-void require_view(const Prior& home, const View& view) {
-  require_prior(home);
-  if (view.other_system) require_other_system(home, *view.other_system);
-  const System& system = *prior_of(home, view).system;
+void require_view(const Prior& fitted, const View& view) {
+  require_prior(fitted);
+  if (view.other_system) require_other_system(fitted, *view.other_system);
+  const System& system = *prior_of(fitted, view).system;
   require_rows(view, system.nq(), system.nc());
   if (view.rows.empty() && view.quantity->n_rows(system.nq(), system.nc()) > 0) {
     throw InputError(fmt::format("view '{}' is of no rows; View::all has every one", view.quantity->word()));
   }
-  const int n_latents = static_cast<int>(home.latents.size());
+  const int n_latents = static_cast<int>(fitted.latents.size());
   const LatentRange shown = view.latent.value_or(0);
   if (view.latent && (shown.first < 0 || shown.n < 1 || shown.first > n_latents - shown.n)) {
     throw InputError(fmt::format("view '{}': the prior has {} latents, numbered from 0, got the latent {}", view.quantity->word(),
@@ -82,10 +82,10 @@ void require_view(const Prior& home, const View& view) {
   static_cast<void>(view.required_time_step());
 }
 
-VectorXd OtherSystem::parameters(const Ref<const VectorXd>& home) const {
+VectorXd OtherSystem::parameters(const Ref<const VectorXd>& fitted) const {
   VectorXd parameters = prior.system->parameter_values();
   for (std::size_t k = 0; k < shared.size(); ++k) {
-    if (shared[k] >= 0) parameters[static_cast<Index>(k)] = home[shared[k]];
+    if (shared[k] >= 0) parameters[static_cast<Index>(k)] = fitted[shared[k]];
   }
   return parameters;
 }
@@ -104,10 +104,10 @@ bool reads_loads(const Prior& prior) {
   });
 }
 
-View pushed(const Prior& home, View view, const VectorXd& push) {
-  std::vector<int> own(home.system->parameters().size());
+View pushed(const Prior& fitted, View view, const VectorXd& push) {
+  std::vector<int> own(fitted.system->parameters().size());
   std::iota(own.begin(), own.end(), 0);
-  OtherSystem there = view.other_system ? *view.other_system : OtherSystem{home, std::move(own)};
+  OtherSystem there = view.other_system ? *view.other_system : OtherSystem{fitted, std::move(own)};
   there.prior.system = std::make_shared<const PushedSystem>(there.prior.system, push);
   for (Latent& latent : there.prior.latents) {
     for (std::shared_ptr<const StateFunction>* function : {&latent.features, &latent.directions}) {
@@ -162,10 +162,10 @@ std::vector<std::string> View::names(const System& system, const std::string& la
   return names;
 }
 
-const Prior& prior_of(const Prior& home, const View& view) { return view.other_system ? view.other_system->prior : home; }
+const Prior& prior_of(const Prior& fitted, const View& view) { return view.other_system ? view.other_system->prior : fitted; }
 
-VectorXd parameters_of(const View& view, const Ref<const VectorXd>& home) {
-  return view.other_system ? view.other_system->parameters(home) : VectorXd(home);
+VectorXd parameters_of(const View& view, const Ref<const VectorXd>& fitted) {
+  return view.other_system ? view.other_system->parameters(fitted) : VectorXd(fitted);
 }
 
 void keep_viewed(const View& view, PriorValues& values) {

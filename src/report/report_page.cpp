@@ -137,17 +137,17 @@ Json prior_json(const FitFile& fit) {
 }
 
 Json observations_json(const FitFile& fit) {
-  const Prior home = fit.prior();
-  const ModelValues values = model_values(home, fit.observations, fit.report.hyperparameters);
+  const Prior fitted = fit.prior();
+  const ModelValues values = model_values(fitted, fit.observations, fit.report.hyperparameters);
   const std::vector<std::int64_t> n_states = fit.n_states();
   Json groups = Json::array();
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
     const std::string latent =
-        !group.view().latent ? "" : home.latents[static_cast<std::size_t>(group.view().latent->first)].name;
+        !group.view().latent ? "" : fitted.latents[static_cast<std::size_t>(group.view().latent->first)].name;
     Json noise = Json::array();
     for (const double one : group.usual_noise(values.noise_stddev[g])) noise.push_back(one);
-    groups.push_back({{"names", group.view().names(*prior_of(home, group.view()).system, latent)},
+    groups.push_back({{"names", group.view().names(*prior_of(fitted, group.view()).system, latent)},
                       {"n", n_states[g]},
                       {"system", g < fit.systems.size() && fit.systems[g] ? fit.systems[g]->system->name() : ""},
                       {"noise", noise},

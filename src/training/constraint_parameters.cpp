@@ -16,7 +16,7 @@ using Eigen::VectorXd;
 namespace {
 
 // The states of the observations of the prior's own system, by group.
-std::vector<const Observations*> at_home(const std::vector<Observations>& observations) {
+std::vector<const Observations*> of_fitted_system(const std::vector<Observations>& observations) {
   std::vector<const Observations*> groups;
   for (const Observations& group : observations) {
     if (!group.view().other_system) groups.push_back(&group);
@@ -108,7 +108,7 @@ LeastSquares solve(const Prior& prior, const std::vector<const Observations*>& g
 
 void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& observations,
                         std::vector<Hyperparameter>& hyperparameters) {
-  const std::vector<const Observations*> groups = at_home(observations);
+  const std::vector<const Observations*> groups = of_fitted_system(observations);
   VectorXd parameters = prior.system->parameter_values();
   std::vector<Hyperparameter*> silent;  // the accelerations say nothing of them
   std::vector<int> indices;             // of all that are estimated
@@ -162,7 +162,7 @@ std::vector<bool> held_in_draws(const Prior& prior, const std::vector<Observatio
   for (const Hyperparameter& h : hyperparameters) {
     if (h.is_system_parameter()) parameters[h.index] = h.value;
   }
-  const std::vector<const Observations*> home = at_home(observations);
+  const std::vector<const Observations*> of_fitted = of_fitted_system(observations);
   std::vector<bool> held(hyperparameters.size());
   for (std::size_t k = 0; k < held.size(); ++k) {
     const Hyperparameter& h = hyperparameters[k];
@@ -176,7 +176,7 @@ std::vector<bool> held_in_draws(const Prior& prior, const std::vector<Observatio
                                                        parameters_of(view, parameters), parameters_of(view, moved)));
     };
     held[k] = std::any_of(observations.begin(), observations.end(), moves_the_constraint) ||
-              (home.size() == observations.size() && !moves_the_system(prior, home, parameters, h.index));
+              (of_fitted.size() == observations.size() && !moves_the_system(prior, of_fitted, parameters, h.index));
   }
   return held;
 }

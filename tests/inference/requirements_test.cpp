@@ -113,7 +113,7 @@ TEST(Requirements, AnotherSystemHasTheLatentsOfThePrior) {
   };
   OtherSystem changed = *other;
   changed.prior.latents.clear();
-  expect(changed, "its other system has 0 latents, that at home 1");
+  expect(changed, "its other system has 0 latents, the fitted one 1");
   changed = *other;
   changed.shared.assign(changed.shared.size(), 99);
   expect(changed, "parameters, numbered from 0, got the number 99");

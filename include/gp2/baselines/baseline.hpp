@@ -57,7 +57,7 @@ struct FitPriorOptions : PriorOptions {
 
 /// make_prior or make_baseline_prior, make_other_system or another system that the baseline sees.
 Prior make_prior(const Model& model, const FitPriorOptions& options);
-std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const FitPriorOptions& options);
+std::shared_ptr<const OtherSystem> make_other_system(const Model& fitted, const Model& other, const FitPriorOptions& options);
 
 /// An entry of a loading C = [W, diag √κ] that is tuned. Files call it by its kind and its index there.
 struct LoadingEntry {
