@@ -85,9 +85,8 @@ def test_parameters_are_found_and_the_mass_only_where_the_log_knows_it(run):
     learned, believed = numbers(output, r"rms error of ddx: (\S+) m/s²; with the first guess believed: (\S+) m/s²")
     assert learned < 0.05 and 5 * learned < believed
     pushed, coasting = numbers(output, r"pushed +(-.*)"), numbers(output, r"coasting +(-?\d.*)")
-    assert pushed[0] < -100 and pushed[4] < -100
-    # what a likelihood ratio excludes at 95 %; two optima of one coasting fit differ by 0.84, and which is found depends on the processor
-    assert max(pushed[1], pushed[3]) < -1.92 < min(coasting)
+    assert pushed[0] < -100 and pushed[1] < -2 and pushed[3] < -2 and pushed[4] < -100
+    assert min(coasting) > -0.5
     assert abs(numbers(output, r"at a wrong mass of 0.3 kg: (\S+) 1/m")[0] - 0.5) < 0.01
 
 
