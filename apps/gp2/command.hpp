@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "gp2/error.hpp"
+#include "gp2/jobs/derive.hpp"
 #include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/jobs/simulate_job.hpp"
@@ -115,5 +116,7 @@ void require_own_system(const std::string& text, const std::string& why);
 
 /// Prints notes to stderr, a line each.
 void print_notes(const std::vector<std::string>& notes);
+/// What became of each coordinate of a raw log, a line each.
+void print_smoothing(const DerivedData& data, const System& system);
 
 }  // namespace gp2::command

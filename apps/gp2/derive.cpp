@@ -32,12 +32,12 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
     for (const DerivedSeries* one : series) sum += one->*member;
     return sum;
   };
-  std::string text =
-      fmt::format("{} samples; lengthscale {:.3g} s, size {:.3g}, noise {:.2e}, bandwidth {:.3g} Hz", total(&DerivedSeries::used),
-                  middle([](const DerivedSeries& one) { return one.model.lengthscale; }),
-                  middle([](const DerivedSeries& one) { return one.model.signal_stddev; }),
-                  middle([](const DerivedSeries& one) { return one.model.noise_stddev; }),
-                  middle([](const DerivedSeries& one) { return one.bandwidth; }));
+  std::string text = fmt::format("{} samples at {:.3g} Hz; lengthscale {:.3g} s, size {:.3g}, noise {:.2e}, bandwidth {:.3g} Hz",
+                                 total(&DerivedSeries::used), middle([](const DerivedSeries& one) { return one.rate; }),
+                                 middle([](const DerivedSeries& one) { return one.model.lengthscale; }),
+                                 middle([](const DerivedSeries& one) { return one.model.signal_stddev; }),
+                                 middle([](const DerivedSeries& one) { return one.model.noise_stddev; }),
+                                 middle([](const DerivedSeries& one) { return one.bandwidth; }));
   if (series.size() > 1) text += " (medians)";
   if (const double resolution = middle([](const DerivedSeries& one) { return one.resolution; }); resolution > 0) {
     text += fmt::format(", resolution {:.3g}", resolution);
@@ -68,7 +68,9 @@ std::string text_of(const std::vector<const DerivedSeries*>& series) {
   return text;
 }
 
-void report(const DerivedData& data, const System& system) {
+}  // namespace
+
+void print_smoothing(const DerivedData& data, const System& system) {
   for (const int j : data.measured) {
     std::vector<const DerivedSeries*> series;
     for (const DerivedSeries& one : data.series) {
@@ -77,6 +79,8 @@ void report(const DerivedData& data, const System& system) {
     print_notes({fmt::format("{}: {}", system.coordinates()[static_cast<std::size_t>(j)].name, text_of(series))});
   }
 }
+
+namespace {
 
 void run(DeriveArguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model, arguments.like});
@@ -91,7 +95,7 @@ void run(DeriveArguments& arguments) {
   const CsvTable table = as_table(data, *model.system, arguments.output);
   table.write(arguments.output);
   print_notes(data.notes);
-  report(data, *model.system);
+  print_smoothing(data, *model.system);
   const std::set<std::string> episodes(data.episodes.begin(), data.episodes.end());  // parts of one have its name
   std::vector<std::string> independent;
   for (const int j : data.independent) independent.push_back(model.system->acceleration_names()[static_cast<std::size_t>(j)]);

@@ -215,6 +215,7 @@ void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
   const FitRequest& request = arguments.request;
   const LearnedLog log = learn_and_smooth(request, CsvTable::read(arguments.raw), arguments.raw_options, stop);
   print_notes(log.data.notes);
+  print_smoothing(log.data, *request.model.system);
   print_notes(log.notes);
   if (!arguments.smoothed.empty()) {
     as_table(log.data, *request.model.system, arguments.smoothed).write(arguments.smoothed);

@@ -57,6 +57,9 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     log_marginal_likelihood_value_ : log p(y) at the fitted values, without hyper-prior
     n_features_in_, feature_names_in_ : number and names of the columns that `fit` was given, as scikit-learn has them
 
+    An input with a delay or a lag is taken as what acts, since rows of X do not say what was commanded before: `fit` warns of it.
+    System.states(log) gives what acts; gp2.fit takes the log itself.
+
     Where it differs from sklearn.gaussian_process.GaussianProcessRegressor: y (n, 1) is predicted as (n, 1), not (n,); before
     fit, predict raises NotFittedError; samples of several outputs belong together, so that each obeys the constraint;
     random_state is 0 unless given. Standard deviations and covariances are those of the function, without measurement noise.
@@ -102,6 +105,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         system = self._given_system()
         self._has_mechanics = system is not None
         if system is not None:
+            _warn_of_late_inputs(system)
             outputs = self._outputs(system, y)
             y = _columns_by_name(y, outputs)
         given = None if system is None else _column_names("X", X)  # before it becomes an array
@@ -139,7 +143,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.posterior_ = gp2.fit(self.system_, (states, accelerations), **options, **others)
         except (gp2.InputError, TypeError) as error:
             raise type(error)(re.sub("^(restarts|threads):", r"n_\1:", str(error))) from None
-        self.log_marginal_likelihood_value_ = -self.posterior_.negative_log_likelihood
+        self.log_marginal_likelihood_value_ = -self.posterior_.report.negative_log_likelihood
         return self
 
     def predict(self, X, return_std: bool = False, return_cov: bool = False):
@@ -279,6 +283,13 @@ def _column_names(what: str, table) -> list[str] | None:
     names = [str(name) for name in names]
     _refuse_twice(what, names)
     return names
+
+
+def _warn_of_late_inputs(system: gp2.System) -> None:
+    if system.late_inputs:
+        warnings.warn(
+            f"system: {', '.join(system.late_inputs)}: acts later than it is commanded. Rows of X are taken as what acts, as "
+            "System.states(log) gives it, not as commands", stacklevel=3)
 
 
 def _refuse_twice(what: str, names: list[str]) -> None:

@@ -180,4 +180,9 @@ py::array to_vector(Eigen::VectorXd values) {
   return own(std::move(values), shape);
 }
 
+py::array read_only(py::array array) {
+  array.attr("flags").attr("writeable") = false;
+  return array;
+}
+
 }  // namespace gp2::python

@@ -62,4 +62,7 @@ py::array to_rows(Eigen::MatrixXd columns);
 py::array to_matrices(const Eigen::MatrixXd& blocks, Eigen::Index rows, Eigen::Index columns);
 py::array to_vector(Eigen::VectorXd values);
 
+/// The array, not to be written to. For copies of what an object holds: what is written to a copy would be lost.
+py::array read_only(py::array array);
+
 }  // namespace gp2::python

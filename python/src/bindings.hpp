@@ -76,8 +76,8 @@ auto unlocked(const Work& work) {
   return work();
 }
 
-/// A str, bytes or os.PathLike.
-std::string path_argument(const py::object& path);
+/// A str, bytes or os.PathLike. @throws py::type_error naming the argument
+std::string path_argument(const py::object& path, const std::string& name = "path");
 
 /// What became of each column of a raw log.
 pybind11::dict report_of(const DerivedData& derived, const System& system);
@@ -145,15 +145,14 @@ auto run_interruptibly(const Work& work, std::atomic<bool>& stop, std::exception
       const py::gil_scoped_release release;
       ready = result.wait_for(std::chrono::milliseconds(50)) == std::future_status::ready;
     }
-    if (ready) return result.get();
-    if (raised) continue;
     try {
-      if (PyErr_CheckSignals() != 0) throw py::error_already_set();
-      poll();
+      if (!raised && PyErr_CheckSignals() != 0) throw py::error_already_set();
+      if (!raised && !ready) poll();
     } catch (...) {
       raised = std::current_exception();
       stop = true;
     }
+    if (ready) return result.get();
   }
 }
 
@@ -167,7 +166,18 @@ auto run_interruptibly(const Work& work, std::atomic<bool>& stop, std::exception
   }
 }
 
-/// The same of work(const std::atomic<bool>* stop). What a signal's handler raises is raised here, whatever work() made of its end.
+/// work(), after which there is nothing to give yet: what it throws has None as that attribute.
+template <typename Work>
+auto before_any(const char* attribute, const Work& work) {
+  try {
+    return work();
+  } catch (...) {
+    raise_with(std::current_exception(), attribute, py::none());
+  }
+}
+
+/// The result of work(const std::atomic<bool>* stop), run as by run_interruptibly. What a signal's handler raises is raised here,
+/// whatever work() made of its end.
 template <typename Work>
 auto run_or_raise(const Work& work) {
   std::atomic<bool> stop = false;

@@ -4,6 +4,8 @@
 
 #include <algorithm>
 #include <iterator>
+#include <mutex>
+#include <optional>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -40,13 +42,44 @@ class Function {
   std::shared_ptr<py::object> function_;
 };
 
+/// The turn of a thread to call functions, with the GIL. The GIL alone does not keep calls apart, because Python switches threads
+/// within a function.
+class Turn {
+ public:
+  Turn() {
+    if (!mutex().try_lock()) {
+      // a thread that waits must not hold the GIL: the function whose turn it is needs it
+      std::optional<py::gil_scoped_release> release;
+      if (PyGILState_Check() == 1) release.emplace();
+      mutex().lock();
+    }
+    acquire_.emplace();
+  }
+  ~Turn() {
+    acquire_.reset();
+    mutex().unlock();
+  }
+  Turn(const Turn&) = delete;
+  Turn& operator=(const Turn&) = delete;
+
+ private:
+  // one for the whole process, because functions of several systems may share what they work on; recursive, because a function may
+  // evaluate another system
+  static std::recursive_mutex& mutex() {
+    static std::recursive_mutex one;
+    return one;
+  }
+
+  std::optional<py::gil_scoped_acquire> acquire_;
+};
+
 using Shape = std::vector<py::ssize_t>;
 
 /// What a function returned for one quantity, as doubles; an extent of −1 may be any. @throws InputError naming function, quantity
 /// and shapes.
 py::array_t<double, py::array::c_style> returned(const py::object& object, const char* function, const char* quantity,
                                                  const char* wanted, const Shape& shape) {
-  const py::array array = py::array::ensure(object);
+  const py::array array = py::array::ensure(without_mask(object));
   if (!array) PyErr_Clear();
   const bool fits =
       array && std::equal(shape.begin(), shape.end(), array.shape(), array.shape() + array.ndim(),
@@ -173,12 +206,12 @@ MechanicsSource source_of(const py::object& mechanics, const py::object& constra
     using States = CallableSystem::States;
     using Parameters = CallableSystem::Parameters;
     definition.evaluate = [=](const States& states, const Parameters& values) {
-      const py::gil_scoped_acquire acquire;
+      const Turn turn;
       return values_of(mechanics(to_rows(states), by_name(parameters, values)), "mechanics", states.cols(), nq, nc);
     };
     if (derivatives) {
       definition.differentiate = [=](const States& states, const Parameters& values, int index) {
-        const py::gil_scoped_acquire acquire;
+        const Turn turn;
         const std::string& name = parameters[static_cast<std::size_t>(index)].name;
         return values_of((*derivatives)(to_rows(states), by_name(parameters, values), name), "derivatives", states.cols(), nq,
                          nc);
@@ -186,7 +219,7 @@ MechanicsSource source_of(const py::object& mechanics, const py::object& constra
     }
     if (residuals) {
       definition.residuals = [=](const States& states, const Parameters& values) -> MatrixXd {
-        const py::gil_scoped_acquire acquire;
+        const Turn turn;
         const py::object result = (*residuals)(to_rows(states), by_name(parameters, values));
         const auto array = returned(result, "residuals", "the result", "(n, rows)", {states.cols(), n_residuals});
         return Eigen::Map<const MatrixXd>(array.data(), n_residuals, states.cols());
@@ -225,7 +258,7 @@ StateCode features_code(const LatentFunction& of, const std::string& what) {
   StateCode code;
   code.reads = of.reads;
   code.evaluate = [=](const StateCode::States& states, const StateCode::Parameters&) -> MatrixXd {
-    const py::gil_scoped_acquire acquire;
+    const Turn turn;
     const auto array =
         returned(of.function(to_rows(states)), what.c_str(), "features", "(n, names)", {states.cols(), of.n_names});
     return Eigen::Map<const MatrixXd>(array.data(), of.n_names, states.cols());
@@ -246,12 +279,12 @@ StateCode directions_code(const LatentFunction& of, const std::string& what, con
   StateCode code;
   code.reads = of.reads;
   code.evaluate = [=](const StateCode::States& states, const StateCode::Parameters& parameters) {
-    const py::gil_scoped_acquire acquire;
+    const Turn turn;
     return matrices(of.function(to_rows(states), named(parameters)), states.cols());
   };
   if (of.derivatives) {
     code.differentiate = [=](const StateCode::States& states, const StateCode::Parameters& parameters, int index) {
-      const py::gil_scoped_acquire acquire;
+      const Turn turn;
       const std::string& name = names[static_cast<std::size_t>(index)];
       return matrices((*of.derivatives)(to_rows(states), named(parameters), name), states.cols());
     };
@@ -268,7 +301,7 @@ std::optional<LatentFunction> function_in(const py::object& given, const std::st
 // what is functions among keywords of System
 std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs) {
   std::map<std::string, ModelCode::OfLatent> out;
-  if (!kwargs.contains("latents")) return out;
+  if (!kwargs.contains("latents") || kwargs["latents"].is_none()) return out;
   std::vector<std::string> parameters;
   if (kwargs.contains("parameters") && !kwargs["parameters"].is_none()) {
     for (const auto& [name, value] : py::dict(kwargs["parameters"])) {
@@ -355,8 +388,9 @@ reads
     names of the entries of a state that the functions read; a log needs these columns. Default: all, t too
 
 Every other keyword is that of System: coordinates, inputs, parameters, latents, noise, …; mass and force are left out.
-What the functions return is checked at every call. They are called with the interpreter's lock, one at a time. A fit of such a
-system is saved without them: gp2.load(path, system=this).
+What the functions return is checked at every call. They are called one at a time in the whole process, with the interpreter's lock.
+So none of them may fit or predict, in several threads, with a system that has functions itself: it would wait for its own end.
+A fit of such a system is saved without them: gp2.load(path, system=this).
 
 Raises InputError naming the function, what was expected and what it returned.)");
 }

@@ -121,7 +121,6 @@ py::object take_progress(py::dict& keywords) {
 
 /// Runs a fit without the interpreter's lock; Ctrl-C ends it with the best so far.
 PyPosterior run(const FitJob& job, const py::object& progress_callback) {
-  tell(job.notes);
   std::atomic<bool> stop = false;
   LastProgress progress;
   std::function<void(const Progress&)> note_progress;
@@ -133,17 +132,14 @@ PyPosterior run(const FitJob& job, const py::object& progress_callback) {
   std::exception_ptr raised;
   std::optional<FitOutcome> outcome;
   try {
+    tell(job.notes);
     outcome = run_interruptibly([&] { return run_fit(job, note_progress, &stop); }, stop, raised, tell_progress);
-  } catch (const Error&) {
-    if (!raised) throw;  // stopped before there was anything to give
+    if (!raised) tell(outcome->notes);
+  } catch (...) {  // there may be nothing to give, or a warning that is an error, which is no reason to lose the fit
+    if (!raised) raised = std::current_exception();
   }
   std::optional<PyPosterior> posterior;
   if (outcome) {
-    try {
-      if (!raised) tell(outcome->notes);
-    } catch (...) {  // a warning that is an error, which is no reason to lose the fit
-      raised = std::current_exception();
-    }
     std::vector<std::string> notes = job.notes;
     notes.insert(notes.end(), outcome->notes.begin(), outcome->notes.end());
     outcome->file.observations.clear();
@@ -154,7 +150,7 @@ PyPosterior run(const FitJob& job, const py::object& progress_callback) {
 }
 
 FitJob prepared(FitRequest request) {
-  return unlocked([&] { return prepare_fit(std::move(request)); });
+  return before_any("posterior", [&] { return unlocked([&] { return prepare_fit(std::move(request)); }); });
 }
 
 PyPosterior fit_model(const PySystem& system, const py::object& data, const py::kwargs& kwargs) {
@@ -163,7 +159,7 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   const py::object progress = take_progress(keywords);
   const auto also = take<py::object>(keywords, "also", py::tuple());
   const auto commands = take<py::object>(keywords, "commands", py::none());
-  read_keywords("fit", keywords, options(request));
+  read_keywords("fit", keywords, options(request), {"system", "data", "commands", "also", "progress"});
   if (!commands.is_none()) request.problem.commands = to_table(commands, "commands");
   request.model = *system.model;
   request.logs = logs_of(data, system.system());
@@ -177,14 +173,18 @@ py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwar
   FitRequest request;
   RawFitOptions raw;
   const py::object progress = take_progress(keywords);
-  read_keywords("fit_raw", keywords, options(request, raw));
+  read_keywords("fit_raw", keywords, options(request, raw), {"system", "data", "progress"});
   request.model = *system.model;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  const LearnedLog log = run_or_raise([&](const std::atomic<bool>* stop) { return learn_and_smooth(request, table, raw, stop); });
+  std::vector<std::string> notes;
+  const LearnedLog log = before_any("posterior", [&] {
+    LearnedLog learned = run_or_raise([&](const std::atomic<bool>* stop) { return learn_and_smooth(request, table, raw, stop); });
+    notes = learned.data.notes;
+    notes.insert(notes.end(), learned.notes.begin(), learned.notes.end());
+    tell(notes);
+    return learned;
+  });
   py::dict report = report_of(log.data, system.system());
-  std::vector<std::string> notes = log.data.notes;
-  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
-  tell(notes);
   report["notes"] = with_keywords(std::move(notes));
   report["gains"] = log.gains;
   CsvTable smoothed = as_table(log.data, system.system(), "smoothed data");
@@ -197,13 +197,13 @@ PyPosterior fit_again(const py::object& path, const py::object& data, const py::
   require_progress(progress);
   const FitFile file = read_fit(path, system);
   const auto started = [&](FitJob job) {
-    if (!checkpoint.is_none()) job.checkpoint = path_argument(checkpoint);
+    if (!checkpoint.is_none()) job.checkpoint = path_argument(checkpoint, "checkpoint");
     return run(job, progress);
   };
   if (data.is_none()) {
     if (!side_information_of(also).empty()) throw InputError("`again`: `also` goes with `data`");
     if (!commands.is_none()) throw InputError("`again`: `commands` goes with `data`");
-    return started(unlocked([&] { return prepare_fit_again(file, threads); }));
+    return started(before_any("posterior", [&] { return unlocked([&] { return prepare_fit_again(file, threads); }); }));
   }
   FitRequest request = request_of(file);
   request.threads = threads;
@@ -212,7 +212,7 @@ PyPosterior fit_again(const py::object& path, const py::object& data, const py::
   request.logs = logs_of(data, *request.model.system);
   request.also = side_information_of(also);
   require_use_of_commands(request);
-  return started(unlocked([&] { return prepare_fit_again(file, std::move(request)); }));
+  return started(before_any("posterior", [&] { return unlocked([&] { return prepare_fit_again(file, std::move(request)); }); }));
 }
 
 std::string fit_documentation() {

@@ -39,8 +39,12 @@ void refuse_unknown_keyword(const std::string& text, const std::string& signatur
   const bool has_others = signatures.find("**") != std::string::npos;
   const py::module_ re = py::module_::import("re");
   const py::list known = re.attr("findall")(R"((\w+): )", signatures);
+  py::dict of_system;  // the keywords of System, which from_callables has too
+  if (text.starts_with("from_callables(")) {
+    of_system = py::module_::import("gp2._model_text").attr("model_text").attr("__kwdefaults__");
+  }
   for (const auto& [keyword, value] : keywords) {
-    if (known.contains(keyword)) continue;
+    if (known.contains(keyword) || of_system.contains(keyword)) continue;
     const auto given = keyword.cast<std::string>();
     if (has_others && (gp2::python::is_keyword(given) || gp2::python::nearest(given, known).empty())) continue;
     gp2::python::refuse_keyword(called(text, signatures), given, known);
@@ -68,6 +72,8 @@ constexpr std::array takes = {
     Takes{"List[str]", "a list of names", &is_list_of_text},
     Takes{"gp2._gp2.System", "a gp2.System (gp2.System.load reads one from a file)",
           [](py::handle value) { return py::isinstance<gp2::python::PySystem>(value); }},
+    Takes{"gp2._gp2.Posterior", "a gp2.Posterior (gp2.load reads one from a file)",
+          [](py::handle value) { return py::isinstance<gp2::python::PyPosterior>(value); }},
 };
 
 // A value of another type than its parameter's, where there is one signature.
@@ -128,10 +134,14 @@ PyObject* dispatch_or_say_why(PyObject* self, PyObject* arguments, PyObject* key
   try {
     const std::string text = py::str(error.value()), signatures = signatures_in(text);
     const auto given = keywords == nullptr ? py::dict() : py::reinterpret_borrow<py::dict>(keywords);
+    const auto positional = py::reinterpret_borrow<py::tuple>(arguments);
+    if (text.starts_with("fit(") && positional.size() > 2) {
+      throw py::type_error("fit() takes a system and data, then keywords; of arrays write fit(system, (X, y))");
+    }
     if (!signatures.empty()) {
       refuse_unknown_keyword(text, signatures, given);
-      refuse_wrong_type(text, signatures, py::reinterpret_borrow<py::tuple>(arguments), given);
-      refuse_missing_argument(text, signatures, py::reinterpret_borrow<py::tuple>(arguments), given);
+      refuse_wrong_type(text, signatures, positional, given);
+      refuse_missing_argument(text, signatures, positional, given);
     }
     error.restore();
   } catch (const py::builtin_exception& refusal) {

@@ -55,9 +55,16 @@ Motion named(SimulatedMotion motion, const System& system, const SwitchingFuncti
   return {std::move(motion), std::move(table), system.constraint_labels(), switching.names()};
 }
 
-// A path, or a table, which has named columns where a Series of numbers by name has none.
+// A path, or a table: what has columns, a structured array, or a mapping whose values have a length.
 bool is_log(const py::object& start) {
-  return py::isinstance<py::str>(start) || py::hasattr(start, "__fspath__") || py::hasattr(start, "columns");
+  if (py::isinstance<py::str>(start) || py::hasattr(start, "__fspath__") || py::hasattr(start, "columns")) return true;
+  const std::optional<py::list> names = column_names(start);
+  if (!names || names->empty()) return false;
+  if (py::isinstance<py::array>(start)) return true;
+  const py::object first = start[(*names)[0]];
+  const bool has_length = PyObject_Size(first.ptr()) >= 0;
+  if (!has_length) PyErr_Clear();
+  return has_length && !py::isinstance<py::str>(first);
 }
 
 MotionStart start_argument(const py::object& start, const System& system) {
@@ -72,7 +79,7 @@ MotionStart start_argument(const py::object& start, const System& system) {
 SimulateRequest simulate_request(const System& system, const py::object& start, const py::object& times, const py::object& inputs,
                                  const py::dict& keywords) {
   SimulateRequest request;
-  read_keywords("simulate", keywords, options(request));
+  read_keywords("simulate", keywords, options(request), {"start", "times", "inputs", "system"});
   request.start = start_argument(start, system);
   const auto points = vector_argument(times, "times");
   request.times = Eigen::Map<const VectorXd>(points.data(), points.size());
@@ -91,25 +98,34 @@ using Uncertainty = std::function<MotionUncertainty(const Trajectory&)>;
 /// The motions of a job, one after the other: a Motion, or a list of them; Ctrl-C ends them. What is raised where one cannot go on,
 /// or by Ctrl-C, has what was reached as its attribute `motion`.
 py::object run_motions(const SimulateJob& job, bool are_many, const Uncertainty& uncertainty) {
-  tell(job.notes);
   std::vector<Trajectory> trajectories;
   std::atomic<bool> stop = false;
   std::exception_ptr raised;
   try {
+    tell(job.notes);
     trajectories = run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {});
   } catch (UnfinishedMotion& error) {
     trajectories = std::move(error.motions);
     if (!raised) raised = numerical_error(error.what());
     if (trajectories.back().times.size() == 0) trajectories.pop_back();  // it did not begin
+  } catch (...) {
+    if (!raised) raised = std::current_exception();
   }
   std::vector<SimulatedMotion> motions;
-  for (std::size_t k = 0; k < trajectories.size(); ++k) {
-    SimulatedMotion& motion = motions.emplace_back(SimulatedMotion{std::move(trajectories[k])});
-    const auto& energy = job.motions[k].energy;
-    if (energy) motion.energy = unlocked([&] { return energy(motion.trajectory.states); });
-    if (uncertainty) motion.uncertainty = unlocked([&] { return uncertainty(motion.trajectory); });
+  for (Trajectory& trajectory : trajectories) motions.push_back(SimulatedMotion{std::move(trajectory)});
+  // what fails after the motions is no reason to lose them
+  try {
+    for (std::size_t k = 0; k < motions.size(); ++k) {
+      SimulatedMotion& motion = motions[k];
+      const auto& energy = job.motions[k].energy;
+      if (energy) motion.energy = unlocked([&] { return energy(motion.trajectory.states); });
+      if (uncertainty) motion.uncertainty = unlocked([&] { return uncertainty(motion.trajectory); });
+    }
+    tell(motion_notes(motions));
+    if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+  } catch (...) {
+    if (!raised) raised = std::current_exception();
   }
-  tell(motion_notes(motions));
   py::list out;
   for (SimulatedMotion& motion : motions) out.append(named(std::move(motion), *job.system, job.options.switching));
   const py::object result = are_many ? py::object(out) : out.empty() ? py::none() : py::object(out[0]);
@@ -120,7 +136,8 @@ py::object run_motions(const SimulateJob& job, bool are_many, const Uncertainty&
 py::object simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
                           const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  return run_motions(prepare_simulation(*system.model, request), /*are_many=*/false, {});
+  const SimulateJob job = before_any("motion", [&] { return prepare_simulation(*system.model, request); });
+  return run_motions(job, /*are_many=*/false, {});
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
@@ -128,7 +145,8 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   const SimulateRequest request = simulate_request(self.system(), start, times, inputs, keywords);
   const Posterior posterior = self.posterior;
   const FitSystem asked = system_of(self.file, posterior.prior(), model_of(system));
-  const SimulateJob job = unlocked([&] { return prepare_simulation(asked, posterior, request); });
+  const SimulateJob job =
+      before_any("motion", [&] { return unlocked([&] { return prepare_simulation(asked, posterior, request); }); });
   return run_motions(job, request.n_samples.has_value(),
                      [&](const Trajectory& motion) { return motion_uncertainty(posterior, motion, asked.other_system); });
 }
@@ -159,7 +177,7 @@ Limits limits_argument(const py::object& limits, const std::string& name) {
 PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, double duration, const py::object& inputs_within,
                               const py::object& within, const PySystem* system, const py::kwargs& keywords) {
   ExciteRequest request;
-  read_keywords("excite", keywords, options(request));
+  read_keywords("excite", keywords, options(request), {"posterior", "start", "duration", "inputs_within", "within", "system"});
   request.start = start_argument(start, system == nullptr ? self.system() : *system->model->system);
   request.duration = duration;
   request.inputs_within = limits_argument(inputs_within, "inputs_within");
@@ -178,12 +196,14 @@ PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, 
   std::optional<PyExcitation> out;
   try {
     out = run_interruptibly(search, stop, raised, [] {});
-  } catch (const Error&) {
-    if (!raised) throw;  // stopped before there was a motion
+    if (!raised) {
+      tell(out->found.notes);
+      tell(motion_notes({out->motion}));
+    }
+  } catch (...) {  // there may be no motion, or a warning that is an error, which is no reason to lose it
+    if (!raised) raised = std::current_exception();
   }
   if (raised) raise_with(raised, "excitation", out ? py::cast(std::move(*out)) : py::none());
-  tell(out->found.notes);
-  tell(motion_notes({out->motion}));
   return std::move(*out);
 }
 
@@ -229,53 +249,55 @@ py::list stick_events(const Motion& motion) {
 }  // namespace
 
 void add_motion(py::module_& module) {
-  py::class_<Motion>(module, "Motion", "A motion at the times asked for.")
+  py::class_<Motion>(module, "Motion", "A motion at the times asked for. Its arrays are copies, not to be written to.")
       .def_property_readonly(
-          "t", [](const Motion& m) { return to_vector(m.trajectory.times); }, "(n) [s]")
+          "t", [](const Motion& m) { return read_only(to_vector(m.trajectory.times)); }, "(n) [s]")
       .def_property_readonly(
-          "states", [](const Motion& m) { return to_rows(m.trajectory.states); },
+          "states", [](const Motion& m) { return read_only(to_rows(m.trajectory.states)); },
           "(n, len(state_names)); of inputs that act late what acts.")
       .def_property_readonly(
-          "q", [](const Motion& m) { return to_rows(m.trajectory.states.topRows(m.trajectory.accelerations.rows())); }, "(n, nq)")
+          "q", [](const Motion& m) { return read_only(to_rows(m.trajectory.states.topRows(m.trajectory.accelerations.rows()))); },
+          "(n, nq)")
       .def_property_readonly(
           "dq",
           [](const Motion& m) {
             const Index nq = m.trajectory.accelerations.rows();
-            return to_rows(m.trajectory.states.middleRows(nq, nq));
+            return read_only(to_rows(m.trajectory.states.middleRows(nq, nq)));
           },
           "(n, nq)")
       .def_property_readonly(
-          "ddq", [](const Motion& m) { return to_rows(m.trajectory.accelerations); }, "(n, nq)")
+          "ddq", [](const Motion& m) { return read_only(to_rows(m.trajectory.accelerations)); }, "(n, nq)")
       .def_property_readonly(
           "std",
           [](const Motion& m) -> py::object {
             if (!m.uncertainty) return py::none();
-            return to_rows(m.uncertainty->stddev);
+            return read_only(to_rows(m.uncertainty->stddev));
           },
           "Standard deviations of ddq along the motion, as the posterior has it (n, nq); None of a model's own motion.")
       .def_property_readonly(
           "distance_from_data",
           [](const Motion& m) -> py::object {
             if (!m.uncertainty) return py::none();
-            return to_vector(m.uncertainty->distance);
+            return read_only(to_vector(m.uncertainty->distance));
           },
           "As of Prediction, along the motion (n); None as std.")
       .def_property_readonly(
           "energy",
           [](const Motion& m) -> py::object {
             if (!m.energy) return py::none();
-            return to_vector(m.energy->values);
+            return read_only(to_vector(m.energy->values));
           },
           "Kinetic and potential energy along the motion (n) [J]; None where the model has no potential.")
       .def_property_readonly(
           "energy_std",
           [](const Motion& m) -> py::object {
             if (!m.energy || m.energy->stddev.size() == 0) return py::none();
-            return to_vector(m.energy->stddev);
+            return read_only(to_vector(m.energy->stddev));
           },
           "Its standard deviations, of a potential that was learned, against the first state (n) [J]; else None.")
       .def_property_readonly(
-          "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
+          "multipliers", [](const Motion& m) { return read_only(to_rows(m.trajectory.records)); },
+          "lambda of the constraints (n, nc)")
       .def_property_readonly(
           "max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; },
           "Largest |c| of position constraints at the times of `t`.")

@@ -56,7 +56,7 @@ void read_named_numbers(py::handle given, NamedNumbers& numbers, const std::stri
   if (py::isinstance<py::dict>(value)) {
     numbers.values = argument<std::map<std::string, double>>(value, name, "numbers by name");
   } else {
-    numbers.file = path_argument(value);
+    numbers.file = path_argument(value, name);
   }
 }
 
@@ -95,8 +95,8 @@ void read_keyword(py::handle given, const Option& option) {
           [&](double* value) { *value = argument<double>(given, name, "a number"); },
           [&](std::string* value) {
             const bool is_path = is_file(option) && py::hasattr(given, "__fspath__");
-            *value =
-                is_path ? path_argument(py::reinterpret_borrow<py::object>(given)) : argument<std::string>(given, name, "a str");
+            *value = is_path ? path_argument(py::reinterpret_borrow<py::object>(given), name)
+                             : argument<std::string>(given, name, "a str");
           },
           [&](std::optional<int>* value) { *value = argument<int>(given, name, "a whole number"); },
           [&](std::optional<std::uint64_t>* value) {
@@ -258,7 +258,8 @@ void refuse_keyword(const std::string& function, const std::string& name, const 
                                    near.empty() ? "" : fmt::format("; did you mean '{}'?", near)));
 }
 
-void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options) {
+void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options,
+                   const std::vector<std::string>& others) {
   for (const auto& [key, value] : keywords) {
     const auto name = key.cast<std::string>();
     const auto option = std::find_if(options.begin(), options.end(), [&](const Option& one) { return keyword_of(one) == name; });
@@ -272,6 +273,7 @@ void read_keywords(const std::string& function, const py::dict& keywords, const 
     }
     py::list known;
     for (const Option& one : options) known.append(keyword_of(one));
+    for (const std::string& one : others) known.append(one);
     refuse_keyword(function, name, known);
   }
 }

@@ -46,9 +46,11 @@ std::string nearest(const std::string& name, const py::list& known);
 
 /// Reads what is left of the keywords of a call into the options of a job.
 /// @param function  for messages: fit
+/// @param others    its parameters that are no options, which an unknown keyword may be meant to be
 /// @throws py::type_error for an unknown keyword, with the nearest there is, or a value of the wrong type; InputError for a
 ///   word that an option does not have.
-void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options);
+void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options,
+                   const std::vector<std::string>& others);
 
 /// The first line of a docstring: fit(system: System, *, mean: Literal["zero", "force"] = "zero", …) -> Posterior
 /// @param first, last  parameters before and after the options, ending and beginning with a comma

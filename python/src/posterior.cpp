@@ -242,18 +242,18 @@ Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, cons
 void add_inputs(py::module_& module) {
   py::class_<Inputs>(module, "Inputs", "Inputs that produce wanted accelerations at n states.")
       .def_property_readonly(
-          "inputs", [](const Inputs& i) { return to_rows(i.found.inputs); }, "What acts (n, nu).")
+          "inputs", [](const Inputs& i) { return read_only(to_rows(i.found.inputs)); }, "What acts (n, nu).")
       .def_property_readonly(
-          "std", [](const Inputs& i) { return to_rows(i.found.stddev()); }, "Standard deviations (n, nu).")
+          "std", [](const Inputs& i) { return read_only(to_rows(i.found.stddev())); }, "Standard deviations (n, nu).")
       .def_property_readonly(
           "cov",
           [](const Inputs& i) {
             const Index nu = i.found.inputs.rows();
-            return to_matrices(i.found.covariance, nu, nu);
+            return read_only(to_matrices(i.found.covariance, nu, nu));
           },
           "Covariance at each state (n, nu, nu).")
       .def_property_readonly(
-          "missed", [](const Inputs& i) { return to_rows(i.found.missed); },
+          "missed", [](const Inputs& i) { return read_only(to_rows(i.found.missed)); },
           "Wanted less predicted accelerations under these inputs (n, d): rounding where the wanted can be produced.")
       .def_readonly("names", &Inputs::names, "Of the inputs.")
       .def("__repr__",
@@ -365,6 +365,9 @@ PyPosterior load(const py::object& path, const PySystem* system) {
 }
 
 void save(const PyPosterior& self, const py::object& path) {
+  if (self.posterior.observations().empty()) {
+    throw InputError("a posterior without data is not saved: save the fit, and call without_data() of what gp2.load gives");
+  }
   FitFile file = self.file;
   file.take_data(self.posterior);
   const std::filesystem::path to = path_argument(path);
@@ -403,7 +406,7 @@ void add_evaluation(py::module_& module) {
       .def_readonly("coverage80_latent", &Calibration::coverage80_latent, "In their 80 % intervals.")
       .def_readonly("coverage95_latent", &Calibration::coverage95_latent, "In their 95 % intervals.")
       .def_property_readonly(
-          "pit", [](const Calibration& c) { return to_vector(c.pit); },
+          "pit", [](const Calibration& c) { return read_only(to_vector(c.pit)); },
           "Share of measurements in each tenth of their predictive distributions: all 0.1 where errors are as predicted.")
       .def(pickled<Calibration>());
   py::class_<Evaluation::Part, Calibration>(module, "EvaluationPart", "Figures of some of the points.")
@@ -426,7 +429,7 @@ void add_evaluation(py::module_& module) {
   py::class_<Evaluation, Calibration>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
       .def_readonly("outputs", &Evaluation::outputs, "Names of the accelerations.")
       .def_property_readonly(
-          "rmse", [](const Evaluation& e) { return to_vector(e.rmse); }, "Per output, physical units.")
+          "rmse", [](const Evaluation& e) { return read_only(to_vector(e.rmse)); }, "Per output, physical units.")
       .def_readonly("rmse_normalised", &Evaluation::rmse_normalised, "Mean over outputs of rmse / training std.")
       .def_readonly("nrmse", &Evaluation::nrmse, "Rms error over rms of the test spreads.")
       .def_readonly("max_constraint_error", &Evaluation::max_constraint_error, "max |A ddq - b|, the model's parameters.")
@@ -623,8 +626,7 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           "remove_oldest",
           [](PyPosterior& self, int n) {
             change(self, [n](PyPosterior& changed) {
-              changed.posterior = remove_oldest(std::move(changed.posterior), n);
-              if (n > 0) changed.file.report.distrusted.clear();  // it counts states from those that are gone
+              changed.posterior = remove_oldest(std::move(changed.posterior), changed.file, n);
             });
           },
           "n"_a = 1, "Remove the n observed states that were added first, in place.")
@@ -633,15 +635,15 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           [](const PyPosterior& self) {
             return PyPosterior{self.file, self.posterior.without_data(), {}};
           },
-          "The prior under the same hyperparameters.");
+          "The prior under the same hyperparameters. It can be copied, but not saved or pickled.");
 }
 
 std::vector<std::string> export_posterior(const PyPosterior& self, const py::object& folder, const PySystem* system,
                                           const py::kwargs& keywords) {
   ExportRequest request;
-  read_keywords("export", keywords, options(request));
+  read_keywords("export", keywords, options(request), {"folder", "system"});
   if (system != nullptr) request.view.system = system->model;
-  const std::filesystem::path to = path_argument(folder);
+  const std::filesystem::path to = path_argument(folder, "folder");
   const PyPosterior held = self;
   const ExportOutcome outcome = unlocked([&] { return export_fit(held.file, held.posterior, request); });
   tell(outcome.notes);
@@ -679,7 +681,11 @@ in a folder that exists.
 FitFile read_fit(const py::object& path, const PySystem* system) {
   const std::filesystem::path from = path_argument(path);
   const ModelCode code = code_of(system);
-  return unlocked([&] { return FitFile::read(from, code); });
+  FitFile file = unlocked([&] { return FitFile::read(from, code); });
+  if (system != nullptr && !code) {
+    throw InputError("system: this fit is all text; to predict under another system, give it to predict(…, system=)");
+  }
+  return file;
 }
 
 void add_posterior(py::module_& module) {
@@ -699,6 +705,9 @@ void add_posterior(py::module_& module) {
   define_potential(posterior);
   define_inverse_dynamics(posterior);
   define_evaluate_and_update(posterior);
+  posterior.def("__copy__", [](const PyPosterior& self) { return self; });
+  posterior.def(
+      "__deepcopy__", [](const PyPosterior& self, const py::dict&) { return self; }, "memo"_a);
   posterior.def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });
 
   module.def(

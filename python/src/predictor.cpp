@@ -227,7 +227,8 @@ system, latent, dt  as of Posterior.predict
 std, jacobian  whether they will be asked for
 storage        'double', or 'single': half the memory and faster, constraints still exact; include/gp2/predictor.hpp has its error
 
-A state is (len(state_names)). A state without a prediction raises InputError.)")
+A state is (len(state_names)). A state without a prediction raises InputError. The predictor is made from the posterior as it is
+now: after update or remove_oldest make a new one.)")
       .def(py::init(&make), "posterior"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(),
            "dt"_a = py::none(), "std"_a = true, "jacobian"_a = true, "storage"_a = "double")
       .def("mean", &PyPredictor::mean, "state"_a, "(d)")
@@ -245,7 +246,7 @@ system   another System with the same coordinates, inputs and latents
 cov      whether it will be asked for
 storage  as of Predictor
 
-A state is (len(state_names)); its inputs are where the search begins. Raises NumericalError where no inputs are found.)")
+A state is (len(state_names)); its inputs are where the search begins. Made from the posterior as it is now, as Predictor. Raises NumericalError where no inputs are found.)")
       .def(py::init(&make_solver), "posterior"_a, py::kw_only(), "outputs"_a = py::none(), "system"_a = nullptr, "cov"_a = true,
            "storage"_a = "double")
       .def("inputs", &PySolver::inputs, "state"_a, "accelerations"_a, "(len(system.inputs))")

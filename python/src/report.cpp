@@ -16,12 +16,12 @@ namespace {
 std::shared_ptr<const Model> model_argument(const py::object& system) {
   if (system.is_none()) return nullptr;
   if (py::isinstance<PySystem>(system)) return system.cast<const PySystem&>().model;
-  return std::make_shared<const Model>(Model::read(path_argument(system)));
+  return std::make_shared<const Model>(Model::read(path_argument(system, "system")));
 }
 
 Report collected(const py::object& fit, const ReportRequest& request, std::vector<std::string>& notes) {
   if (!py::isinstance<PyPosterior>(fit)) {
-    const std::filesystem::path path = path_argument(fit);
+    const std::filesystem::path path = path_argument(fit, "fit");
     return unlocked([&] { return collect_report(path, request, notes); });
   }
   const auto& self = fit.cast<const PyPosterior&>();
@@ -65,7 +65,7 @@ std::string report(const py::object& fit, const py::object& path, const py::obje
 
 std::string plot_fit(const py::object& fit, const py::object& path, const py::kwargs& keywords) {
   PlotRequest request;
-  read_keywords("plot", keywords, options(request));
+  read_keywords("plot", keywords, options(request), {"fit", "path"});
   if (!path.is_none()) require_name_of_svg(path_argument(path));
   const auto picture = [&request](const Posterior& posterior, const Model& model) {
     return unlocked([&] { return plot(learned_curve(posterior, request), model); });
@@ -88,7 +88,7 @@ std::string plot_fit(const py::object& fit, const py::object& path, const py::kw
 py::dict curve_of(const PyPosterior& self, const py::kwargs& keywords) {
   using namespace py::literals;
   PlotRequest request;
-  read_keywords("plot_learned", keywords, options(request));
+  read_keywords("plot_learned", keywords, options(request), {"what", "ax"});
   const Posterior posterior = self.posterior;
   const LearnedCurve curve = unlocked([&] { return learned_curve(posterior, request); });
   const LearnedForce& force = curve.force;

@@ -1,3 +1,4 @@
+#include <cmath>
 #include <limits>
 
 #include <fmt/format.h>
@@ -83,6 +84,17 @@ Eigen::VectorXd parameter_values(const System& system, const std::map<std::strin
   return values;
 }
 
+// Those with a delay or a lag, known or to be estimated.
+std::vector<std::string> late_inputs(const PySystem& self) {
+  const std::vector<std::string>& inputs = self.system().inputs();
+  std::vector<std::string> late;
+  for (std::size_t k = 0; k < inputs.size(); ++k) {
+    const Actuator& one = self.model->actuators[k];
+    if (!one.is_direct() || one.is_estimated()) late.push_back(inputs[k]);
+  }
+  return late;
+}
+
 py::dict parameters_of(const System& system) {
   py::dict values;
   for (const Parameter& parameter : system.parameters()) values[py::str(parameter.name)] = parameter.value;
@@ -107,9 +119,24 @@ Rows states_of(const PySystem& self, const py::object& states) {
   return {is_table ? states_of_table(self, states, py::none(), "states") : states, self.system().state_names(), "states"};
 }
 
+// What M, A, b or F read must be there: of a missing entry they would be NaN.
+void require_what_mechanics_read(const System& system, const Rows& rows) {
+  const auto states = rows.matrix();
+  const std::vector<std::string> names = system.state_names();
+  const std::vector<bool> mechanics = system.reads(SystemPart::mechanics), force = system.reads(SystemPart::force);
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!mechanics[k] && !force[k]) continue;
+    for (Eigen::Index i = 0; i < states.cols(); ++i) {
+      if (!std::isnan(states(static_cast<Eigen::Index>(k), i))) continue;
+      throw InputError(fmt::format("states: row {} has no '{}', which M, A, b or F read", i + 1, names[k]));
+    }
+  }
+}
+
 Mechanics evaluate(const PySystem& self, const py::object& states, const py::object& parameters) {
   const System& system = self.system();
   const Rows rows = states_of(self, states);
+  require_what_mechanics_read(system, rows);
   const auto given = argument<std::map<std::string, double>>(as_dict(parameters), "parameters", "a dict of names to numbers");
   const Eigen::VectorXd at = parameter_values(system, given);
   SystemValues values = unlocked([&] { return system.evaluate(rows.matrix(), at); });
@@ -128,13 +155,13 @@ CsvTable generate_table(const PySystem& self, std::optional<int> n, std::uint64_
 
 std::string show_system(const PySystem& self, const py::kwargs& keywords) {
   ShowRequest asked;
-  read_keywords("show", keywords, options(asked));
+  read_keywords("show", keywords, options(asked), {});
   return show(*self.model, asked);
 }
 
 std::string show_posterior(const PyPosterior& self, const py::kwargs& keywords) {
   ShowRequest asked;
-  read_keywords("show", keywords, options(asked));
+  read_keywords("show", keywords, options(asked), {});
   FitFile fit = self.file;
   fit.take_data(self.posterior);
   return show(fit, asked, [](const std::string& note) { return with_keywords(note); });
@@ -142,7 +169,7 @@ std::string show_posterior(const PyPosterior& self, const py::kwargs& keywords) 
 
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const py::kwargs& keywords) {
   ResampleOptions asked;
-  read_keywords("resample", keywords, options(asked));
+  read_keywords("resample", keywords, options(asked), {"system", "data", "n"});
   asked.n = n;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   const Resample chosen = run_or_raise([&](const std::atomic<bool>* stop) { return resample(*self.model, table, asked, stop); });
@@ -152,7 +179,7 @@ CsvTable resample_table(const PySystem& self, const py::object& data, int n, con
 
 py::tuple derive_table(const PySystem& self, const py::object& data, const py::object& like, const py::kwargs& keywords) {
   DeriveOptions asked;
-  read_keywords("derive", keywords, options(asked));
+  read_keywords("derive", keywords, options(asked), {"system", "data", "like"});
   if (!like.is_none()) asked.like = to_table(like, "like", CsvTable::Keep::text);
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   const DerivedData derived = run_or_raise([&](const std::atomic<bool>* stop) {
@@ -236,7 +263,7 @@ States::States(const py::object& data, const PredictedView& at, const Eigen::Vec
     for (Eigen::Index i = 0; i < states.cols(); ++i) {
       const double value = states(static_cast<Eigen::Index>(k), i);
       if (std::isfinite(value)) continue;
-      throw InputError(fmt::format("states: row {}, column {} ({}): {} is not a finite number", i, k, names[k], value));
+      throw InputError(fmt::format("states: row {}, column {} ({}): {} is not a finite number", i + 1, k + 1, names[k], value));
     }
   }
 }
@@ -295,6 +322,7 @@ void define_names_and_parameters(py::class_<PySystem>& system) {
           "coordinates", [](const PySystem& self) { return coordinate_names(self.system()); }, "Names, in the order of q.")
       .def_property_readonly(
           "inputs", [](const PySystem& self) { return self.system().inputs(); }, "Names, in the order of u.")
+      .def_property_readonly("late_inputs", &late_inputs, "Names of the inputs that act later than they are commanded.")
       .def_property_readonly(
           "parameters", [](const PySystem& self) { return parameters_of(self.system()); }, "Name to value.")
       .def_property_readonly(
@@ -316,7 +344,8 @@ void define_evaluate_and_generate(py::class_<PySystem>& system) {
       .def("evaluate", &evaluate, py::arg("states"), py::arg("parameters") = py::dict(),
            "M, A, b, F at states (n, len(state_names)), or at those of a table by column names, with parameters by name where "
            "they\n"
-           "are not the model's own.")
+           "are not the model's own.\n\n"
+           "Raises InputError where a state lacks what M, A, b or F read.")
       .def(
           "true_acceleration",
           [](const PySystem& self, const py::object& states) {
@@ -336,7 +365,9 @@ void define_evaluate_and_generate(py::class_<PySystem>& system) {
             return states_of_table(self, data, columns, "data");
           },
           py::arg("data"), py::arg("columns") = py::none(),
-          "States (n, len(state_names)) of a table by its column names. What the model does not read may be missing: NaN.");
+          "States (n, len(state_names)) of a table by its column names. What the constraints, the mass matrix and the latents do "
+          "not\n"
+          "read may be missing: NaN.");
 }
 
 /// These have their keywords in signatures of our own; the setting for that ends with this function.

@@ -58,7 +58,7 @@ CsvTable make_table(const py::object& columns, const std::optional<std::string>&
   return !name || *name == table.name() ? table : CsvTable::parse(table.text(), *name);
 }
 
-py::object column_of(const CsvTable& table, const std::string& name) {
+py::array column_of(const CsvTable& table, const std::string& name) {
   const int column = table.find(name);
   if (column < 0) {
     throw py::key_error(fmt::format("{} has no column '{}'; it has: {}", table.name(), name, fmt::join(table.header(), ", ")));
@@ -66,16 +66,21 @@ py::object column_of(const CsvTable& table, const std::string& name) {
   if (table.is_text(column)) {
     py::list cells;
     for (int i = 0; i < table.n_rows(); ++i) cells.append(table.cell(i, column));
-    return py::module_::import("numpy").attr("array")(cells);
+    return read_only(py::module_::import("numpy").attr("array")(cells));
   }
   Eigen::VectorXd values(table.n_rows());
   for (int i = 0; i < table.n_rows(); ++i) values[i] = table.number_or_empty(i, column);
-  return to_vector(std::move(values));
+  return read_only(to_vector(std::move(values)));
 }
 
 }  // namespace
 
-std::string path_argument(const py::object& path) { return py::bytes(py::module_::import("os").attr("fsencode")(path)); }
+std::string path_argument(const py::object& path, const std::string& name) {
+  if (!is_path(path) && !py::isinstance<py::bytes>(path)) {
+    throw py::type_error(fmt::format("{}: expected a path, got {}", name, std::string(py::repr(path))));
+  }
+  return py::bytes(py::module_::import("os").attr("fsencode")(path));
+}
 
 CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Keep keep) {
   if (py::isinstance<CsvTable>(data)) return data.cast<CsvTable>();
@@ -117,8 +122,9 @@ void add_table(py::module_& module) {
              return py::isinstance<py::str>(name) && table.find(name.cast<std::string>()) >= 0;
            })
       .def("__getitem__", &column_of, py::arg("name"),
-           "A column (n,), NaN where the cell is empty; of strings where no cell is a number.\n\nRaises KeyError when there is "
-           "none, InputError when some cells are numbers and one is not.")
+           "A column (n,), NaN where the cell is empty; of strings where no cell is a number. It is a copy, not to be written "
+           "to.\n\n"
+           "Raises KeyError when there is none, InputError when some cells are numbers and one is not.")
       // names and cells of a file need not be UTF-8
       .def(py::pickle([](const CsvTable& table) { return py::make_tuple(py::bytes(table.name()), py::bytes(table.text())); },
                       [](const py::tuple& state) {

@@ -105,10 +105,12 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
     throw InputError(fmt::format("{}: not a table but {}: a CSV log is wanted here", where,
                                  is_json ? "JSON, as gp2 fit writes it" : "a model file, by its name"));
   }
-  if (header.size() == 1 && header[0].find_first_of(";\t") != std::string::npos) {
+  if (header.size() == 1 && !header[0].starts_with('#') && header[0].find_first_of(";\t ") != std::string::npos) {
     throw InputError(
         fmt::format("{}: the header is not separated by commas but by '{}'; write commas, and '.' as the decimal point", where,
-                    header[0].find(';') != std::string::npos ? ";" : "tab"));
+                    header[0].find(';') != std::string::npos    ? ";"
+                    : header[0].find('\t') != std::string::npos ? "tab"
+                                                                : "space"));
   }
   std::set<std::string_view> seen;
   for (std::size_t k = 0; k < header.size(); ++k) {

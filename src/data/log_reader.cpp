@@ -45,7 +45,7 @@ void require_a_number(const Eigen::RowVectorXd& values, const CsvTable& table, i
 }  // namespace
 
 LogReader::LogReader(const CsvTable& table, const System& system, const std::map<std::string, std::string>& columns)
-    : table_(table), system_(system), columns_(columns) {
+    : table_(table), system_(system), given_(columns), columns_(columns) {
   std::vector<std::string> own_names = system.state_names();
   for (const Coordinate& coordinate : system.coordinates()) own_names.push_back(coordinate.acceleration());
 
@@ -128,7 +128,6 @@ int LogReader::require(const std::string& name) {
     throw InputError(fmt::format("{}: column '{}' is read as {} and as {}; each needs a column of its own (`map=LOGNAME={}`)",
                                  table_.name(), found, used->second, name, name));
   }
-  if (found != name) aliases_used_[name] = found;
   return column;
 }
 
@@ -206,6 +205,23 @@ int LogReader::episode_column() {
   const int column = table_.find("episode");
   if (column >= 0) used_.emplace(column, "episode");
   return column;
+}
+
+std::vector<std::string> LogReader::notes() const {
+  const bool has_given = std::ranges::any_of(given_, [&](const auto& one) { return table_.find(one.second) >= 0; });
+  std::vector<std::string> notes;
+  for (const auto& [column, name] : used_) {
+    const std::string& found = table_.header()[static_cast<std::size_t>(column)];
+    const auto given = given_.find(name);
+    // a table with none of the given names may be one of gp2's own
+    if (has_given && given != given_.end() && given->second != found) {
+      notes.push_back(fmt::format("warning: {}: no column '{}', which is to be {}: column '{}' is read instead", table_.name(),
+                                  given->second, name, found));
+    } else if (found != name && !name.ends_with("_std")) {
+      notes.push_back(fmt::format("column '{}' taken as {}", found, name));
+    }
+  }
+  return notes;
 }
 
 std::vector<std::string> LogReader::unused_columns() const {

@@ -60,6 +60,14 @@ FitFile::FitFile(Model fitted_model, FitPriorOptions options_of_prior, const Fit
   throw InputError("FitFile: the hyperparameters of the report are not those of the posterior");
 }
 
+namespace {
+
+bool is_empty(const std::vector<Observations>& observations) {
+  return std::ranges::all_of(observations, [](const Observations& group) { return group.n_data() == 0; });
+}
+
+}  // namespace
+
 std::vector<std::int64_t> FitFile::n_states() const {
   if (report.inducing && report.inducing->summary) return report.inducing->summary->kept.n_states;
   std::vector<std::int64_t> n;
@@ -105,17 +113,12 @@ void FitFile::write(const std::filesystem::path& path) const {
   }
   json["data_source"] = data_source;
   if (!logs.empty()) json["logs"] = logs_json(logs);
+  if (is_empty(observations)) throw InputError(fmt::format("{}: no observation is left to write", path.string()));
   json["observations"] = Json::array();
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Model* other = observations[g].view().other_system && g < systems.size() ? systems[g].get() : nullptr;
     if (observations[g].view().other_system && other == nullptr) {
       throw InputError(fmt::format("{}: the model file of the system of observations {} is not given", path.string(), g + 1));
-    }
-    if (observations[g].n_data() == 0) {
-      throw InputError(
-          fmt::format("{}: none of the observations {} of '{}' is left, and the file keeps their noise: leave one at "
-                      "least (a larger window), or fit anew to the others",
-                      path.string(), g + 1, (other != nullptr ? *other : model).name));
     }
     json["observations"].push_back(observations_json(observations[g], fitted, other));
   }
@@ -193,7 +196,7 @@ FitFile fit_from(ParsedJson& json, const ModelCode& code) {
     }
     fit.observations.push_back(observations_from(group, prior, std::move(other_system)));
   }
-  if (fit.observations.empty()) throw InputError("no observations");
+  if (is_empty(fit.observations)) throw InputError("no observations");
   if (code && !code_is_used) throw InputError("code is given, but this fit is all text: read it without");
   fit.report.hyperparameters = hyperparameters_from(json.at("hyperparameters"));
   locate_in_model(fit.report.hyperparameters, prior, fit.observations);

@@ -107,6 +107,7 @@ MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names
     if (!json.contains(names[k])) continue;
     const Json& values = json.at(names[k]);
     std::transform(values.begin(), values.end(), matrix.row(static_cast<Index>(k)).begin(), entry);
+    if (n == 0) continue;
     const double largest =
         matrix.row(static_cast<Index>(k)).array().isNaN().select(0, matrix.row(static_cast<Index>(k)).cwiseAbs()).maxCoeff();
     if (largest > largest_number) {

@@ -79,7 +79,7 @@ Observations observations_from(const ParsedJson& json, const Prior& fitted, std:
   const Prior& prior = prior_of(fitted, view);
   const System& system = *prior.system;
   const int n = integer(json.at("n"));
-  if (n < 1) throw InputError(fmt::format("{} observations are not possible", n));
+  if (n < 0) throw InputError(fmt::format("{} observations are not possible", n));
   VectorXd noise_stddev = vector_from(json.at("noise_stddev"));
   if (noise_stddev.size() != view.size() || !(noise_stddev.array() >= smallest_scale).all() ||
       !(noise_stddev.array() <= largest_number).all()) {

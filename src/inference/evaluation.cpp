@@ -192,20 +192,35 @@ VectorXd pit_histogram(const Ref<const VectorXd>& z, int n_bins) {
 
 std::vector<int> observed_rows(const Posterior& posterior) { return rows_of(posterior.observations(), {}); }
 
+namespace {
+
+/// Of numbers that stand for so many each.
+struct MeanSquare {
+  double n = 0, square = 0;
+
+  void add(double number, double weight) {
+    square = n > 0 ? (n * square + weight * number * number) / (n + weight) : number * number;
+    n += weight;
+  }
+  [[nodiscard]] double root() const { return n > 0 ? std::sqrt(square) : not_a_number; }
+};
+
+}  // namespace
+
 MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
   MatrixXd noise(std::ssize(rows), n_states);
   for (Index r = 0; r < noise.rows(); ++r) {
-    double usual = not_a_number, factor = 1;
-    bool is_first = true, is_first_stated = true;
+    MeanSquare usual, factor;
     for_each_observed(posterior.observations(), {}, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
       const Observations& group = posterior.observations()[g];
       const VectorXd sigma = posterior.noise_stddev(g);
-      if (std::exchange(is_first, false)) usual = group.usual_noise(sigma)[k];
-      if (group.states_noise(k) && std::exchange(is_first_stated, false)) factor = sigma[k];
+      const auto n = static_cast<double>((!group.values().row(k).array().isNaN()).count());
+      usual.add(group.usual_noise(sigma)[k], n);
+      if (group.states_noise(k)) factor.add(sigma[k], n);
     });
-    noise.row(r).setConstant(usual);
+    noise.row(r).setConstant(usual.root());
     for (Index i = 0; i < n_states && stated.size() > 0; ++i) {
-      if (!std::isnan(stated(r, i))) noise(r, i) = factor * stated(r, i);
+      if (!std::isnan(stated(r, i))) noise(r, i) = (factor.n > 0 ? factor.root() : 1) * stated(r, i);
     }
   }
   return noise;

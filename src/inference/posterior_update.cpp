@@ -44,7 +44,8 @@ void condition_anew(Posterior::Implementation& self) {
 // has its own for what is added to the group.
 std::size_t group_of(const Posterior& posterior, const Observations& added) {
   const std::vector<Observations>& groups = posterior.observations();
-  std::size_t group = 0;
+  // where the oldest may have to go, what is added joins the last group alone: a file has its states group after group, the oldest first
+  std::size_t group = posterior.summary() || groups.empty() ? 0 : groups.size() - 1;
   const auto belongs = [&] {
     const Observations& there = groups[group];
     if (there.has_sums() || there.view() != added.view() || there.noise().has_scale() != added.noise().has_scale()) return false;

@@ -94,7 +94,14 @@ void check_columns_of(const CsvTable& table, const LogReader& reader, const Whol
     good(fmt::format("{} of {} values of {} are not measured: their cells are empty", n_missing, values.size(),
                      accelerations[static_cast<std::size_t>(row)]));
   }
-  for (const auto& [name, found] : reader.aliases_used()) good(fmt::format("column '{}' taken as {}", found, name));
+  constexpr std::string_view warning = "warning: ";
+  for (const std::string& note : reader.notes()) {
+    if (note.starts_with(warning)) {
+      findings.push_back({Level::warning, note.substr(warning.size())});
+    } else {
+      good(note);
+    }
+  }
   const std::vector<std::string> unused = reader.unused_columns();
   if (!unused.empty()) good(fmt::format("columns not needed: {}", fmt::join(unused, ", ")));
 }
@@ -299,8 +306,8 @@ void check_turns(const WholeLog& log, const System& system, int j, std::vector<F
   if (!q.hasNaN() && q.maxCoeff() - q.minCoeff() < std::numbers::pi) return;  // its velocity, or t, is in another unit
   Eigen::Index forth = 0, back = 0;
   for (Eigen::Index i = 0; i < n; ++i) {
-    const double step = t[i + 1] - t[i], turned = step * dq[i];
-    if (!(step > 0)) return;  // also where t is not known
+    const double turned = std::max(0.0, t[i + 1] - t[i]) * dq[i];  // NaN where t is not known
+    if (std::abs(q[i + 1] - q[i]) < std::numbers::pi) continue;    // t is in another unit than the velocity's
     forth += turned > std::numbers::pi ? 1 : 0;
     back += turned < -std::numbers::pi ? 1 : 0;
   }
@@ -353,8 +360,16 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
   const std::string rest = text_of_rest(model, system.parameter_values(), log.states, log.accelerations);
   if (!rest.empty()) findings.push_back({Level::warning, rest});
   check_values(log, system, findings);
-  for (std::string& text : wrong_rates(system, log.states, log.accelerations, log.reads_time))
+  double unit_of_time = 1;
+  for (std::string& text : wrong_rates(system, log.states, log.accelerations, log.reads_time, &unit_of_time))
     findings.push_back({Level::warning, std::move(text)});
+  if (unit_of_time != 1) {
+    findings.push_back(
+        {Level::warning,
+         fmt::format("the rates of the coordinates say that t counts {:g} s, not seconds: a fit does not mind, but "
+                     "motions over t would be too slow; convert it",
+                     unit_of_time)});
+  }
   check_mechanics(model, log.states, findings);
   if (has_error(findings)) return;
   append(findings, check_data(system, log.states, system.parameter_values(), log.accelerations, log.stddev, log.stated,

@@ -141,6 +141,26 @@ SameTimes same_times_of(const std::vector<Measurement>& used) {
   return out;
 }
 
+/// The longest run of equal positions.
+struct Still {
+  int n = 0;
+  double first = 0, last = 0;  // times
+};
+
+/// @param all  in order of time
+Still longest_still(const std::vector<Measurement>& all) {
+  Still longest, now;
+  double value = not_a_number;
+  for (const Measurement& one : all) {
+    if (one.velocity) continue;
+    if (one.value != value) now = {0, one.time, one.time};
+    value = one.value;
+    ++now.n, now.last = one.time;
+    if (now.n > longest.n) longest = now;
+  }
+  return longest;
+}
+
 /// A coordinate of one episode.
 struct Task {
   int coordinate = 0, episode = 0;
@@ -149,6 +169,8 @@ struct Task {
   SmootherModel model;  // of the positions about their mean
   double kurtosis = 0;
   SameTimes same_times;
+  Still still;
+  bool jumps_after_still = false;           // which was said
   Eigen::Matrix3Xd course;                  // the learned motion that the fit is about; empty: the mean
   double gain = 0;                          // by it, in log likelihood
   std::vector<Eigen::Matrix3d> covariance;  // of the motion smoothed without it; then of the motion, where constraints are held
@@ -196,11 +218,57 @@ class Deriver {
       }
     }
     data_.notes = std::move(raw_.notes);
+    for (Task& task : tasks_) task.still = longest_still(task.channel.measurements);
+    leave_out_wrong_velocities();
     warn_of_jumps();
   }
 
+  /// Those that are not the rates of their positions: merged with them they would spoil both.
+  void leave_out_wrong_velocities() {
+    for (const int j : data_.measured) {
+      const Coordinate& coordinate = system_.coordinates()[static_cast<std::size_t>(j)];
+      std::string reason;
+      int n = 0, n_wrong = 0;
+      for (Task& task : tasks_) {
+        if (task.coordinate != j) continue;
+        ++n;
+        const std::string text = better_rate_of(task.channel, coordinate);
+        if (text.empty()) continue;
+        ++n_wrong;
+        if (reason.empty()) reason = text;
+      }
+      if (n_wrong == 0) continue;
+      for (Task& task : tasks_) {
+        if (task.coordinate == j) std::erase_if(task.channel.measurements, [](const Measurement& one) { return one.velocity; });
+      }
+      data_.notes.push_back(fmt::format("warning: {}: {} is not the rate of {} over t{}: {}. It is left out", log_.name(),
+                                        coordinate.velocity(), coordinate.name,
+                                        n > 1 ? fmt::format(" in {} of {} episodes", n_wrong, n) : "", reason));
+    }
+  }
+
+  /// What else the velocities of a channel would have to be; empty where they are right, or few.
+  static std::string better_rate_of(const Channel& channel, const Coordinate& coordinate) {
+    constexpr std::size_t fewest = 30, enough = 300'000;
+    std::vector<double> times, values, rates;
+    for (const Measurement& one : channel.measurements) {  // at one time positions come first
+      if (one.velocity) {
+        if (!times.empty() && times.back() == one.time) rates.back() = one.value;
+      } else if (times.empty() || one.time > times.back()) {
+        if (times.size() == enough) break;
+        times.push_back(one.time), values.push_back(one.value), rates.push_back(not_a_number);
+      }
+    }
+    if (std::ranges::count_if(rates, [](double one) { return !std::isnan(one); }) < std::ssize(rates) / 2) return "";
+    if (times.size() < fewest) return "";
+    const auto row = [](const std::vector<double>& of) -> Eigen::RowVectorXd {
+      return Eigen::Map<const Eigen::RowVectorXd>(of.data(), std::ssize(of));
+    };
+    return better_rate({row(times), coordinate.name, row(values), coordinate.angle, {row(rates)}, {coordinate.velocity()}, 0});
+  }
+
   void warn_of_jumps() {
-    for (const Task& task : tasks_) {
+    for (Task& task : tasks_) {
       const std::optional<Jump> jump = jump_of(task.channel.measurements);
       if (!jump) continue;
       constexpr double turn = 2 * std::numbers::pi, about = 0.05;
@@ -213,13 +281,14 @@ class Deriver {
         continue;
       }
       constexpr int many = 20;
+      task.jumps_after_still = jump->n_equal >= many;
       data_.notes.push_back(
           fmt::format("warning: {}: {} jumps by {:.3g} at t = {:.6g} and stays there{}", log_.name(), name_of(task.coordinate),
                       jump->by, episode_of(task.episode).start + jump->time,
-                      jump->n_equal < many
-                          ? ": was its encoder set anew? Split the log there by a column `episode`"
+                      !task.jumps_after_still
+                          ? ": was its encoder set anew? Split the log there by a column 'episode'"
                           : fmt::format(", after {} equal samples: was its sensor stuck? Leave these rows out and split the log "
-                                        "there by a column `episode`",
+                                        "there by a column 'episode'",
                                         jump->n_equal)));
     }
   }
@@ -322,6 +391,22 @@ class Deriver {
       tell_progress();
     });
     if (!warn_of_a_coarse_clock()) warn_of_fast_motions();
+    warn_of_stuck_sensors();
+  }
+
+  // noise that no encoder's step hides does not pause
+  void warn_of_stuck_sensors() {
+    constexpr int many = 20;
+    for (std::size_t k = 0; k < tasks_.size(); ++k) {
+      const Task& task = tasks_[k];
+      const DerivedSeries& series = data_.series[k];
+      if (task.still.n < many || series.resolution > 0 || series.noise_unseen || task.jumps_after_still) continue;
+      const double start = episode_of(task.episode).start;
+      data_.notes.push_back(
+          fmt::format("warning: {}: {} is the same in {} samples, from t = {:.6g} to {:.6g}, although it has noise: was its "
+                      "sensor stuck? Leave these rows out",
+                      log_.name(), name_of(task.coordinate), task.still.n, start + task.still.first, start + task.still.last));
+    }
   }
 
   /// Writes the motion of a series, and its deviations, into the rows of its episode.
@@ -470,7 +555,7 @@ class Deriver {
         if (one.coordinate != j || one.noise_unseen) continue;
         ++n;
         const bool stands_out = one.kurtosis > even || one.outliers >= many * (one.used + one.outliers);
-        if (!stands_out || !(one.bandwidth > share * one.rate / 2)) continue;
+        if (!stands_out || !(one.bandwidth > share * one.rate / 2) || !is_smoothed_away(one)) continue;
         ++n_fast;
         rate = one.rate;
       }
@@ -480,6 +565,15 @@ class Deriver {
                       "accelerations are smoothed too much; log at a higher rate",
                       log_.name(), name_of(j), rate, n > 1 ? fmt::format(", in {} of {} episodes", n_fast, n) : ""));
     }
+  }
+
+  /// Whether the deviations of the accelerations are no small part of these.
+  [[nodiscard]] bool is_smoothed_away(const DerivedSeries& series) const {
+    constexpr double little = 0.02;
+    const Index first = first_row_[static_cast<std::size_t>(series.episode)], n = last_row(series.episode) - first;
+    const auto rms = [&](const auto& row) { return std::sqrt(row.segment(first, n).array().square().mean()); };
+    return rms(data_.stddev.row(2 * Index{system_.nq()} + series.coordinate)) >
+           little * rms(data_.accelerations.row(series.coordinate));
   }
 
   static std::vector<double> spaces_of(const std::vector<Measurement>& used) {
@@ -503,6 +597,7 @@ class Deriver {
     out.gain = task.gain;
     out.resolution = task.channel.resolution;
     out.used = static_cast<int>(used.size());
+    out.has_velocities = std::ranges::any_of(used, &Measurement::velocity);
     out.missing = task.channel.missing;
     out.repeated = task.channel.repeated;
     out.outliers = static_cast<int>(task.fit.outliers.size());
@@ -573,12 +668,40 @@ class Deriver {
     return driven;
   }
 
+  struct Hole {
+    double length = 0, start = 0;
+  };
+
+  /// The longest time without a value of a channel, where that is many of its usual steps; else 0.
+  static Hole longest_hole(const Channel& channel, const Episode& episode) {
+    constexpr double many = 10;
+    std::vector<double> times = {episode.times.front()}, steps;
+    for (const Measurement& one : channel.measurements) {
+      if (times.size() > 1 && one.time > times.back()) steps.push_back(one.time - times.back());
+      times.push_back(one.time);
+    }
+    times.push_back(episode.times.back());
+    Hole longest;
+    for (std::size_t k = 1; k < times.size(); ++k) {
+      if (times[k] - times[k - 1] > longest.length) longest = {times[k] - times[k - 1], episode.start + times[k - 1]};
+    }
+    return !steps.empty() && longest.length <= many * median(steps) ? Hole{} : longest;
+  }
+
+  /// Of the log, below its header: the first with a time.
+  static int line_of(const Episode& episode, double time) {
+    const auto at = std::lower_bound(episode.times.begin(), episode.times.end(), time);
+    return episode.rows[static_cast<std::size_t>(at - episode.times.begin())] + 2;
+  }
+
   // each input goes through the filter of the slowest coordinate that it drives: a smoother of the same spectrum and noise is that filter
   void add_inputs() {
     for (std::size_t u = 0; u < system_.inputs().size(); ++u) {
       if (!raw_.has_input(u)) continue;
       const std::vector<bool> driven = driven_by(u);
       std::vector<double> as_logged;
+      std::vector<int> lines;
+      Hole longest;
       for (int e = 0; e < std::ssize(episodes_); ++e) {
         const Episode& episode = episode_of(e);
         const auto slowest_of = [&](bool those_driven) {
@@ -592,7 +715,13 @@ class Deriver {
         const DerivedSeries* slowest = slowest_of(/*those_driven=*/true);
         if (!slowest) slowest = slowest_of(/*those_driven=*/false);
         const Channel channel = raw_.input(u, episode);
-        for (const Measurement& one : channel.measurements) as_logged.push_back(one.value + channel.mean);
+        for (const Measurement& one : channel.measurements) {
+          as_logged.push_back(one.value + channel.mean);
+          lines.push_back(line_of(episode, one.time));
+        }
+        if (const Hole hole = longest_hole(channel, episode);
+            hole.length > longest.length && hole.length * slowest->bandwidth > 1)
+          longest = hole;
         const VectorXd times = times_to_write(episode);
         const Index first = first_row_[static_cast<std::size_t>(e)];
         smooth_each(slowest->model, channel.measurements, times,
@@ -601,7 +730,15 @@ class Deriver {
                     });
       }
       const Eigen::Map<const Eigen::RowVectorXd> commands(as_logged.data(), std::ssize(as_logged));
-      if (auto text = clipped_input(system_.inputs()[u], commands)) data_.notes.push_back(*std::move(text));
+      const std::string& name = system_.inputs()[u];
+      if (auto text = clipped_input(name, commands)) data_.notes.push_back(*std::move(text));
+      if (auto text = far_values_text(name, {commands}, {lines}))
+        data_.notes.push_back(fmt::format("warning: {}: {}", log_.name(), *text));
+      if (longest.length > 0) {
+        data_.notes.push_back(fmt::format(
+            "warning: {}: the input {} has no value for {:.3g} s, from t = {:.6g} on: what is written there is a guess",
+            log_.name(), name, longest.length, longest.start));
+      }
     }
   }
 
@@ -791,7 +928,8 @@ class Deriver {
       if (!contradicted) data_.notes.push_back(fact + ": `hold_constraints` makes use of that");
     }
     if (contradicted) data_.notes.push_back(fmt::format("warning: {}: {}", log_.name(), *contradicted));
-    if (options_.hold_constraints && redundancy == 0 && system_.nc() > 0)
+    // a fit of a raw log holds what there is
+    if (options_.hold_constraints && !options_.keep_positions && redundancy == 0 && system_.nc() > 0)
       data_.notes.emplace_back("no constraint holds among the measured coordinates alone: there is nothing to hold");
   }
 

@@ -446,7 +446,7 @@ std::vector<Option> options(ExciteRequest& request) {
       {"rows", &request.n_rows, "N", "number of measurements along the motion, evenly spaced in time", "", "n_rows"},
       {"harmonics", &request.n_harmonics, "K", "number of frequencies of each input: 1/duration … K/duration [Hz]", "",
        "n_harmonics"},
-      {"motions", &request.n_motions, "M", "number of motions to try", "", "n_motions"},
+      {"motions", &request.n_motions, "M", "number of motions to try, rounded up to whole generations", "", "n_motions"},
       {"seed", &request.seed, "S", "random seed of the search"},
       columns_option(request.columns, "columns by other names, if `start` is a log"),
       threads_option(request.threads),

@@ -22,6 +22,7 @@
 #include "gp2/jobs/actuator_fit.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_time.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "inference/cross_validation.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/doubts.hpp"
@@ -364,6 +365,20 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   tests.add_notes(notes);
 }
 
+// Accelerations say nothing of what acts in impacts alone.
+void explain_restitution(const Model& model, std::vector<std::string>& notes) {
+  const SymbolicSystem* const system = model.symbolic_system();
+  if (system == nullptr) return;
+  for (const ConstraintRow& row : system->definition().constraints) {
+    if (!row.contact) continue;
+    for (const std::string& name : model.graph->variables_of(row.contact->restitution)) {
+      const std::string begin = fmt::format("warning: the data do not determine {}.", name);
+      if (std::erase_if(notes, [&](const std::string& note) { return note.starts_with(begin); }) > 0)
+        notes.push_back(fmt::format("the data do not determine {}, which acts in impacts alone: gp2 shoot estimates it", name));
+    }
+  }
+}
+
 FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
   options.progress = progress;
@@ -384,6 +399,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
   if (!unsaved.empty()) outcome.notes.push_back(fmt::format("warning: a checkpoint was not saved: {}", unsaved));
   for (std::string& note : notes_of(result.report, outcome.posterior)) outcome.notes.push_back(std::move(note));
+  explain_restitution(job.file.model, outcome.notes);
   if (result.report.inducing) add_inducing_note(*result.report.inducing, outcome.notes);
   if (const int n_all = n_states(job.problem.observations);
       options.n_train > 0 && options.n_train < n_all && options.max_iterations > 0) {
@@ -695,6 +711,12 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
 }
 
 FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
+  const auto side_information =
+      std::ranges::find_if(fit.observations, [](const Observations& group) { return !group.view().is_of_ddq(); });
+  if (request.also.empty() && side_information != fit.observations.end()) {
+    throw InputError(fmt::format("`again`: the fit learned from {} too: give it with `also={}:FILE.csv`",
+                                 side_information->view().quantity->word(), side_information->view().quantity->word()));
+  }
   FitJob job = prepare_fit(std::move(request));
   if (fit.logs.empty()) return job;
   for (const LogFile& log : job.file.logs) {

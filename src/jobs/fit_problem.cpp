@@ -191,13 +191,46 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
           .half_range = scales.feature_range.back() / 2};
 }
 
+// Mean square by which values differ from that at the nearest other state of their log: tells which of two logs has less noise, before
+// any is estimated.
+double roughness(const Observations& group, Index k) {
+  constexpr Index most = 300;
+  std::vector<Index> measured;
+  for (Index i = 0; i < group.n_data(); ++i) {
+    if (!std::isnan(group.values()(k, i))) measured.push_back(i);
+  }
+  const auto stride = std::max<Index>(1, std::ssize(measured) / most);
+  std::vector<Index> some;
+  for (Index at = 0; at < std::ssize(measured); at += stride) some.push_back(measured[static_cast<std::size_t>(at)]);
+  MatrixXd states = group.states()(Eigen::all, some);
+  for (Index r = 0; r < states.rows(); ++r) {
+    auto row = states.row(r);
+    const double spread = row.hasNaN() ? 0 : (row.array() - row.mean()).matrix().norm();
+    if (spread > 0) {
+      row /= spread;
+    } else {
+      row.setZero();  // what does not move, or is not known, tells no states apart
+    }
+  }
+  double sum = 0;
+  for (Index i = 0; i < states.cols(); ++i) {
+    VectorXd distance = (states.colwise() - states.col(i)).colwise().squaredNorm().transpose();
+    distance[i] = std::numeric_limits<double>::infinity();
+    Index nearest = 0;
+    distance.minCoeff(&nearest);
+    const auto value = [&](Index at) { return group.values()(k, some[static_cast<std::size_t>(at)]); };
+    sum += std::pow(value(i) - value(nearest), 2);
+  }
+  return sum / static_cast<double>(std::max<Index>(1, states.cols()));
+}
+
 // Where the noise is estimated, the discrepancy is in proportion to it: one of a guess would take its place. An acceleration that no
-// estimated noise is of goes with the first.
+// estimated noise is of goes with the first. Of logs whose noise starts alike, that of the smoothest leads, whatever their order.
 void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyperparameters) {
   const auto latent = static_cast<int>(problem.prior.latents.size()) - 1;
   std::vector<Hyperparameter*> leaders(static_cast<std::size_t>(problem.prior.system->nq()), nullptr);
   std::vector<bool> is_observed(leaders.size(), false);
-  std::vector<double> largest(leaders.size(), 0);
+  std::vector<double> largest(leaders.size(), 0), smoothest(leaders.size(), 0);
   Hyperparameter* first = nullptr;
   for (std::size_t g = 0; g < problem.observations.size(); ++g) {
     const Observations& group = problem.observations[g];
@@ -206,8 +239,11 @@ void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyp
     for (Index k = 0; k < usual.size(); ++k) {
       const auto j = static_cast<std::size_t>(group.view().rows[static_cast<std::size_t>(k)]);
       is_observed[j] = true;
-      if (usual[k] <= largest[j]) continue;
+      if (usual[k] < largest[j]) continue;
+      const double rough = problem.observations.size() > 1 ? roughness(group, k) : 0;
+      if (usual[k] == largest[j] && rough >= smoothest[j]) continue;
       largest[j] = usual[k];
+      smoothest[j] = rough;
       const auto h = std::find_if(hyperparameters.begin(), hyperparameters.end(), [&](const Hyperparameter& other) {
         return other.kind == Hyperparameter::Kind::noise_stddev && other.owner == static_cast<int>(g) && other.index == k;
       });

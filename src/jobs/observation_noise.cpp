@@ -138,10 +138,12 @@ MatrixXd stated_stddevs(const Model& model, const std::vector<std::string>& name
     if (reader.stddev_column(names[k]).empty()) continue;
     auto row = stddev.row(static_cast<Index>(k));
     row = reader.stddevs({names[k]});
+    // exactly 1 is how observations mark what has no deviation of its own (Observations::states_noise)
+    row = (row.array() == 1).select(std::nextafter(1.0, 2.0), row);
     const auto coordinate = static_cast<std::size_t>(std::find(every.begin(), every.end(), names[k]) - every.begin());
     if (coordinate >= model.noise.floor.size()) continue;
     const double floor = model.noise.floor[coordinate];
-    row = (row.array().square() + floor * floor).sqrt();
+    if (floor > 0) row = (row.array().square() + floor * floor).sqrt();
   }
   return stddev;
 }

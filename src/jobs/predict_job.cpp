@@ -374,6 +374,33 @@ std::vector<Option> options(EvaluateRequest& request) {
           threads_option(request.threads)};
 }
 
+namespace {
+
+// Logs of one fit may have been measured by other sensors than this one.
+void note_differing_noise(const Posterior& posterior, const std::vector<int>& rows, const std::string& log,
+                          std::vector<std::string>& notes) {
+  constexpr double alike = 1.5;
+  const std::vector<std::string> names = posterior.prior().system->acceleration_names();
+  for (const int row : rows) {
+    double least = std::numeric_limits<double>::infinity(), most = 0;
+    for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+      const Observations& group = posterior.observations()[g];
+      const auto at = std::ranges::find(group.view().rows, row);
+      if (!group.view().is_of_ddq() || at == group.view().rows.end()) continue;
+      const double noise = group.usual_noise(posterior.noise_stddev(g))[at - group.view().rows.begin()];
+      least = std::min(least, noise), most = std::max(most, noise);
+    }
+    if (!(most > alike * least)) continue;
+    const std::string& name = names[static_cast<std::size_t>(row)];
+    notes.push_back(fmt::format(
+        "warning: {}: the logs of the fit differ in noise, {} from {:.3g} to {:.3g}: their root mean square is taken for "
+        "that of this log; a column {}_std states its own",
+        log, name, least, most, name));
+  }
+}
+
+}  // namespace
+
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request,
                          const std::atomic<bool>* stop) {
   require_threads(request.threads);
@@ -392,6 +419,7 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
   log = CsvTable();
   EvaluationOptions options{at.view.other_system, {}, request.threads, stop};
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
+  if (states.stated_stddev.size() == 0) note_differing_noise(posterior, rows, name, out.notes);
   out.evaluation =
       at_states_of(name, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });
   for (std::string& text : constraint_warnings(posterior, at.view.other_system, name, states.states, rows, states.accelerations,

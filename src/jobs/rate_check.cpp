@@ -121,8 +121,10 @@ class RateRows {
   }
 
  private:
-  /// NaN where the log pauses
-  [[nodiscard]] double length(Index row) const { return lengths_[row] > 1.5 * usual_length_ ? not_a_number : lengths_[row]; }
+  /// NaN where the log pauses, or begins anew
+  [[nodiscard]] double length(Index row) const {
+    return lengths_[row] > 1.5 * usual_length_ || !(lengths_[row] > 0) ? not_a_number : lengths_[row];
+  }
 
   const RateColumns& columns_;
   ArrayXd lengths_, changes_;
@@ -286,7 +288,9 @@ std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, c
   constexpr Index fewest = 30, enough = 300'000;
   const Index n = std::min(states.cols(), enough);
   const RowVectorXd t = times.head(n);
-  if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return {};
+  if (t.hasNaN() || t.size() < fewest) return {};
+  constexpr Index few = 10;  // one step in so many may go back, as from episode to episode, or stand still
+  if (few * ((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() <= 0).count() > t.size()) return {};
   std::vector<RowVectorXd> q, dq, ddq;
   std::vector<std::string> velocities;
   for (int j = 0; j < system.nq(); ++j) {
@@ -315,14 +319,16 @@ std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, c
 }  // namespace
 
 std::vector<std::string> wrong_rates(const System& system, const Ref<const MatrixXd>& states,
-                                     const Ref<const MatrixXd>& accelerations, bool reads_time) {
-  RowVectorXd t = states.row(system.layout().t());
+                                     const Ref<const MatrixXd>& accelerations, bool reads_time, double* unit) {
+  const RowVectorXd t = states.row(system.layout().t());
   std::vector<std::string> notes = wrong_rates_over(t, system, states, accelerations);
-  const int n_smaller_units = reads_time ? 0 : 3;
-  for (int unit = 0; unit < n_smaller_units && !notes.empty(); ++unit) {
-    t *= 1e-3;
-    std::vector<std::string> others = wrong_rates_over(t, system, states, accelerations);
-    if (others.size() < notes.size()) notes = std::move(others);
+  if (unit != nullptr) *unit = 1;
+  for (const double smaller : {1e-3, 1e-6, 1e-9}) {
+    if (reads_time || notes.empty()) break;
+    std::vector<std::string> others = wrong_rates_over(smaller * t, system, states, accelerations);
+    if (others.size() >= notes.size()) continue;
+    notes = std::move(others);
+    if (unit != nullptr) *unit = smaller;
   }
   return notes;
 }

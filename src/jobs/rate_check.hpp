@@ -23,7 +23,7 @@ struct RateColumns {
 
 /// What else the rate would have to be for the values to follow from it: a factor, a lag, another column. Empty where it is right,
 /// where nothing explains the values better, or where rows are too far apart to tell.
-/// @param columns  t increases
+/// @param columns  t increases, but for a few steps
 std::string better_rate(const RateColumns& columns);
 
 /// Of a log in the order of time: which velocities are not the rates of their coordinates, and which accelerations not those of
@@ -32,8 +32,10 @@ std::string better_rate(const RateColumns& columns);
 /// @param accelerations  (nq × N); NaN: not measured
 /// @param reads_time     whether the model reads t, which then is in seconds. Else t may be in ms, µs or ns too: in the unit under
 ///                       which the fewest columns are wrong.
+/// @param unit           receives that unit [s]
 std::vector<std::string> wrong_rates(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                     const Eigen::Ref<const Eigen::MatrixXd>& accelerations, bool reads_time);
+                                     const Eigen::Ref<const Eigen::MatrixXd>& accelerations, bool reads_time,
+                                     double* unit = nullptr);
 
 /// What a column looks like that was clipped.
 struct PileUp {

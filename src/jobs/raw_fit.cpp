@@ -59,15 +59,12 @@ LearnedAccelerations left_out_accelerations(const Posterior& posterior, const st
 }
 
 // Whether sums over windows say what the options ask to be learned.
-bool learns_from_windows(const FitRequest& request, const DerivedData& data, const CsvTable& log) {
+bool learns_from_windows(const FitRequest& request, const DerivedData& data) {
   const FitProblemOptions& problem = request.problem;
   if (problem.robust || problem.baseline || problem.noise_stddev || problem.protocol.name == Protocol::Name::paper) return false;
-  const System& system = *request.model.system;
-  if (system.has_constraint_noise()) return false;
+  if (request.model.system->has_constraint_noise()) return false;
   // velocities that are measured say more than the positions alone
-  LogReader reader = open_log(request.model, log, problem.columns);
-  return std::ranges::none_of(
-      data.measured, [&](int j) { return reader.column(system.coordinates()[static_cast<std::size_t>(j)].velocity()) >= 0; });
+  return std::ranges::none_of(data.series, &DerivedSeries::has_velocities);
 }
 
 // Windows of a smoothed log, and the states that their sums are over: all of them, or such as lie about some rows.
@@ -383,7 +380,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
   };
 
   const auto with_windows = [&](LearnedLog learned) {
-    if (!options.windows || !learns_from_windows(request, learned.data, log)) return learned;
+    if (!options.windows || !learns_from_windows(request, learned.data)) return learned;
     const CsvTable table = as_table(learned.data, system, log.name());
     constexpr int n_values = 2 * n_window_states;  // of accelerations, that are no more than can be fitted in a minute or two
     const auto n_independent = static_cast<int>(std::max<Index>(1, std::ssize(learned.data.independent)));

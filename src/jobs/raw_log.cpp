@@ -97,6 +97,36 @@ void share_out_runs(std::vector<Measurement>& positions) {
   }
 }
 
+/// A sensor that is slower than the log holds each value for k rows: of these the first is kept, the others are no samples.
+/// @param steady  whether equal values come from a coarse encoder too, and then not always k at a time
+/// @return k; 1: where it is not so
+int leave_out_held(std::vector<Measurement>& samples, bool steady) {
+  constexpr std::size_t fewest = 20;  // values
+  constexpr double share = 0.95;
+  std::vector<std::size_t> starts;
+  for (std::size_t i = 1; i < samples.size(); ++i) {
+    if (samples[i].value != samples[i - 1].value) starts.push_back(i);
+  }
+  if (starts.size() < fewest) return 1;
+  std::vector<std::size_t> runs;
+  for (std::size_t i = 1; i < starts.size(); ++i) runs.push_back(starts[i] - starts[i - 1]);
+  std::vector<std::size_t> sorted = runs;
+  std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2), sorted.end());
+  const std::size_t k = sorted[sorted.size() / 2];
+  const auto n_regular = std::ranges::count_if(runs, [&](std::size_t n) { return steady ? n % k == 0 : n <= k + 1; });
+  if (k < 2 || static_cast<double>(n_regular) < share * static_cast<double>(runs.size())) return 1;
+  std::vector<Measurement> kept;
+  std::size_t next = starts.front() % k;  // before the first change no one knows where a value began
+  for (std::size_t i = 0; i < samples.size(); ++i) {
+    if (i > 0 && samples[i].value != samples[i - 1].value) next = i;
+    if (i != next) continue;
+    kept.push_back(samples[i]);
+    next += k;
+  }
+  samples = std::move(kept);
+  return static_cast<int>(k);
+}
+
 // Its values become those about their mean.
 void centre(Channel& channel) {
   const auto n = static_cast<double>(channel.measurements.size());
@@ -177,13 +207,19 @@ void RawLog::find_columns() {
     input_column_.push_back(reader_.column(input));
     if (input_column_.back() < 0) notes.push_back(fmt::format("the log has no input {}", input));
   }
+  std::vector<std::string> unused = reader_.unused_columns();
+  std::erase_if(unused, [&](const std::string& name) {
+    const std::string episode = options_.episode_column.empty() ? "episode" : options_.episode_column;
+    return name == episode || std::ranges::count(options_.keep, name) > 0;
+  });
+  if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log_.name(), fmt::join(unused, ", ")));
   for (const std::string& name : options_.keep) {
     if (log_.find(name) < 0) {
       throw InputError(
           fmt::format("`keep`: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
     }
   }
-  for (const auto& [name, found] : reader_.aliases_used()) notes.push_back(fmt::format("{} is the column '{}'", name, found));
+  std::ranges::move(reader_.notes(), std::back_inserter(notes));
 }
 
 void RawLog::find_episodes() {
@@ -258,6 +294,24 @@ double RawLog::unit_of(double usual_step) {
   return unit.seconds;
 }
 
+/// Steps of the coordinate that is measured most often: rows of other columns may lie a few µs beside its own.
+std::vector<double> RawLog::steps_between_samples() const {
+  std::vector<double> most;
+  for (const int j : measured_) {
+    std::vector<double> steps;
+    for (const Episode& episode : episodes_) {
+      double before = not_a_number;
+      for (std::size_t k = 0; k < episode.rows.size(); ++k) {
+        if (is_missing(log_.cell(episode.rows[k], position_column_.at(j)))) continue;
+        if (episode.times[k] > before) steps.push_back(episode.times[k] - before);
+        before = episode.times[k];
+      }
+    }
+    if (steps.size() > most.size()) most = std::move(steps);
+  }
+  return most;
+}
+
 // What comes after a long pause is no continuation: times from one start would lose digits, and nothing bridges it.
 void RawLog::split_at_pauses() {
   constexpr double pause = 1000;  // usual steps
@@ -270,6 +324,7 @@ void RawLog::split_at_pauses() {
     }
   }
   if (steps.empty()) return;
+  if (std::vector<double> of_samples = steps_between_samples(); !of_samples.empty()) steps = std::move(of_samples);
   const double usual = median(steps), unit = unit_of(usual);
   std::vector<Episode> parts;
   int n_pauses = 0, n_left_out = 0;
@@ -412,6 +467,12 @@ Channel RawLog::motion(int coordinate, const Episode& episode) {
   read_column(episode, column, false, channel);
   require_motion(episode, column, channel);
   channel.resolution = resolution_of(values_of(channel.measurements));
+  const std::size_t n_read = channel.measurements.size();
+  if (const int held = leave_out_held(channel.measurements, channel.resolution > 0); held > 1) {
+    channel.repeated += static_cast<int>(n_read - channel.measurements.size());
+    notes.push_back(fmt::format("{}{}: each value stands in {} rows: only the first of these is a sample", place_of(column),
+                                in_episode(episode), held));
+  }
   if (system_.coordinates()[static_cast<std::size_t>(coordinate)].angle) unwrap(episode, column, channel);
   centre(channel);
   if (channel.resolution > 0) share_out_runs(channel.measurements);

@@ -51,6 +51,7 @@ class RawLog {
   void find_episodes();
   void split_at_pauses();
   double unit_of(double usual_step);
+  [[nodiscard]] std::vector<double> steps_between_samples() const;
   [[nodiscard]] bool moves(const Episode& part) const;
   void read_column(const Episode& episode, int column, bool velocity, Channel& channel) const;
   void unwrap(const Episode& episode, int column, Channel& channel);

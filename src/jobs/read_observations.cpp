@@ -46,7 +46,7 @@ bool has_values(LogReader& reader, const CsvTable& log, const std::string& name)
 }
 
 void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
-  for (const auto& [name, found] : reader.aliases_used()) notes.push_back(fmt::format("column '{}' taken as {}", found, name));
+  std::ranges::move(reader.notes(), std::back_inserter(notes));
   const std::vector<std::string> unused = reader.unused_columns();
   if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log.name(), fmt::join(unused, ", ")));
 }

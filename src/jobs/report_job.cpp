@@ -111,7 +111,7 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   std::vector<ReportData> all;
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
-    if (!group.view().is_of_ddq()) continue;
+    if (!group.view().is_of_ddq() || group.n_data() == 0) continue;
     ReportData data = data_at(posterior, group.states(), group.view().rows, group.values(),
                               group.noise().of_values(posterior.noise_stddev(g), group.n_data()), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
@@ -145,7 +145,7 @@ void add_truth(const ReportRequest& request, Report& report) {
   const ModelMotion motion(truth);
   bool any = false;
   for (ReportData& data : report.data) {
-    if (request.system && !data.is_test) continue;  // it is the truth of that system
+    if (request.system ? !data.is_test : data.is_of_other_system) continue;  // it is the truth of one system
     data.truth = motion.acceleration(data.states);
     for (Index i = 0; i < data.truth.cols(); ++i) {
       if (data.truth.col(i).allFinite()) {
@@ -261,13 +261,29 @@ void move_largest(std::vector<LearnedForce>& some, std::vector<LearnedForce>& al
 
 }  // namespace
 
+namespace {
+
+// Where the fitted system was observed: by its accelerations, or else by what else is known.
+MatrixXd own_states(const Posterior& posterior) {
+  MatrixXd states(posterior.prior().system->layout().size(), 0);
+  for (const bool of_ddq : {true, false}) {
+    if (states.cols() > 0) break;
+    for (const Observations& group : posterior.observations()) {
+      if (group.view().other_system || group.view().is_of_ddq() != of_ddq) continue;
+      states.conservativeResize(Eigen::NoChange, states.cols() + group.n_data());
+      states.rightCols(group.n_data()) = group.states();
+    }
+  }
+  return states;
+}
+
+}  // namespace
+
 std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
   constexpr Index n_points = 101;
   const Prior& prior = posterior.prior();
-  const auto own = std::ranges::find_if(
-      posterior.observations(), [](const Observations& group) { return !group.view().other_system && group.n_data() > 0; });
-  if (prior.reference || own == posterior.observations().end()) return {};
-  const MatrixXd& states = own->states();
+  const MatrixXd states = own_states(posterior);
+  if (prior.reference || states.cols() == 0) return {};
   const VectorXd usual = usual_state(prior, states);
   const std::vector<std::string> entries = prior.system->state_names();
   const bool has_several = std::ranges::any_of(

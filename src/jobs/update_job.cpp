@@ -359,6 +359,7 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   }();
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
   if (n_more > 0) fit.notes.reset();
+  if (n_more > 0 && fit.report.inducing) fit.report.inducing->stretches.reset();  // they were of the data before
   if (n_more > 0 && log.file()) fit.logs.push_back(*log.file());
   const bool is_last = (", " + fit.data_source).ends_with(", " + log.name());
   if (n_more > 0 && !is_last) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
@@ -373,14 +374,30 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   return all;
 }
 
+Posterior remove_oldest(Posterior&& posterior, FitFile& fit, int n) {
+  std::vector<int> n_before;
+  for (const Observations& group : posterior.observations()) n_before.push_back(group.n_data());
+  Posterior left = remove_oldest(std::move(posterior), n);
+  std::vector<DistrustedValue>& distrusted = fit.report.distrusted;
+  if (left.observations().size() != n_before.size()) {
+    distrusted.clear();  // groups that are gone have given others their numbers
+    return left;
+  }
+  for (DistrustedValue& one : distrusted) {
+    const auto group = static_cast<std::size_t>(one.group);
+    one.state -= n_before[group] - left.observations()[group].n_data();
+  }
+  std::erase_if(distrusted, [](const DistrustedValue& one) { return one.state < 0; });
+  return left;
+}
+
 void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request) {
   if (!request.window) return;
   if (*request.window < 1) throw InputError(fmt::format("`window`: must be positive, got {}", *request.window));
   const std::int64_t n_old = posterior.n_states() - *request.window;
   if (n_old > 0) {
-    posterior = remove_oldest(std::move(posterior), static_cast<int>(n_old));
+    posterior = remove_oldest(std::move(posterior), fit, static_cast<int>(n_old));
     fit.notes.reset();
-    fit.report.distrusted.clear();  // it counts states from those that are gone
   }
   // logs of which nothing is left
   auto oldest = fit.logs.end();

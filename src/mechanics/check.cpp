@@ -452,7 +452,8 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
   double worst = 0;
   std::string worst_label;
   for (Index k = 0; k < n_residuals; ++k) {
-    if (!(error[k] > worst * size[k] && size[k] > 0)) continue;
+    constexpr double rounding = 1e-15;  // what is no faster than rounding of the others stands still
+    if (!(error[k] > worst * size[k] && size[k] > rounding * size.maxCoeff())) continue;
     worst = error[k] / size[k];
     worst_label = system.residual_labels()[static_cast<std::size_t>(k)].text;
   }

@@ -26,6 +26,19 @@ std::string difference(const Prior& fitted, const Prior& other) {
   };
   std::string text = differ("its coordinates are", coordinates(*other.system), coordinates(*fitted.system));
   if (text.empty()) text = differ("its inputs are", inputs(*other.system), inputs(*fitted.system));
+  // matched by their places, and called the same in another order they would act for each other
+  const auto names = [](const Prior& prior) {
+    std::vector<std::string> all;
+    for (const Latent& latent : prior.latents) {
+      if (!std::ranges::count(all, latent.name)) all.push_back(latent.name);
+    }
+    return all;
+  };
+  const std::vector<std::string> here_names = names(fitted), there_names = names(other);
+  if (text.empty() && std::ranges::is_permutation(here_names, there_names)) {
+    text = differ("its latents are", fmt::format("{}", fmt::join(there_names, ", ")),
+                  fmt::format("{}", fmt::join(here_names, ", ")));
+  }
   if (text.empty()) {
     text = differ("the number of its latents is", std::to_string(other.latents.size()), std::to_string(fitted.latents.size()));
   }
@@ -38,7 +51,9 @@ std::string difference(const Prior& fitted, const Prior& other) {
     };
     const auto directions = [](const Latent& latent) {
       if (latent.is_potential) return std::string("\"potential\"");
-      if (latent.directions) return fmt::format("{} of its own", latent.size());
+      if (latent.directions) {
+        return fmt::format("{} of its own ({})", latent.size(), latent.base == Latent::Base::force ? "forces" : "accelerations");
+      }
       return std::string(latent.base == Latent::Base::force ? "\"force\"" : "\"acceleration\"");
     };
     const auto features = [](const Latent& latent) { return fmt::format("{}", fmt::join(latent.feature_names, ", ")); };
@@ -46,6 +61,8 @@ std::string difference(const Prior& fitted, const Prior& other) {
     text = differ(fmt::format("the kernel {} is", of), kernel(there), kernel(here));
     if (text.empty()) text = differ(fmt::format("the features {} are", of), features(there), features(here));
     if (text.empty()) text = differ(fmt::format("the directions {} are", of), directions(there), directions(here));
+    const auto sign = [](const Latent& latent) { return std::string(latent.is_positive ? "positive" : "of either sign"); };
+    if (text.empty()) text = differ(fmt::format("the values {} are", of), sign(there), sign(here));
   }
   return text;
 }

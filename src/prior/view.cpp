@@ -47,7 +47,8 @@ void require_other_system(const Prior& fitted, const OtherSystem& other) {
       return text;
     };
     if (kernel(its) != kernel(mine) || its.n_features() != mine.n_features() || its.size() != mine.size() ||
-        its.n_functions() != mine.n_functions() || its.is_positive != mine.is_positive || its.is_potential != mine.is_potential) {
+        its.n_functions() != mine.n_functions() || its.base != mine.base || its.is_positive != mine.is_positive ||
+        its.is_potential != mine.is_potential) {
       throw InputError(
           fmt::format("view: the latent '{}' of its other system is of another kind than '{}' of the fitted one; "
                       "make_other_system makes one that fits",

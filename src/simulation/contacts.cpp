@@ -96,7 +96,10 @@ Contacts::Gaps Contacts::gaps_at(VectorXd state) const {
     out.rate[k] = residuals[residuals_[contact] + 1];
     out.A.row(k) = values.A(0).row(row);
     out.b[k] = values.b(0)[row];
-    out.margin[k] = of_rounding * out.A.row(k).cwiseAbs().dot(state.head(layout_.nq).cwiseAbs());
+    const auto rounding = [&](const auto& moved) { return of_rounding * out.A.row(k).cwiseAbs().dot(moved.cwiseAbs()); };
+    out.margin[k] = rounding(state.head(layout_.nq));
+    // a contact that was just made neither opens nor closes
+    if (std::abs(out.rate[k]) <= 10 * rounding(state.segment(layout_.dq(0), layout_.nq))) out.rate[k] = 0;
   }
   return out;
 }

@@ -105,8 +105,7 @@ bool ConstraintProjection::newton(const Level& level, VectorXd& state) const {
   constexpr int max_iterations = 100;
   constexpr double at_rounding = 0.5 * std::numeric_limits<double>::epsilon();
   constexpr double converging = 1e-9;  // Newton's method is quadratic here: where it gains no more, rounding is reached
-  // Velocities are brought to rounding of their own size: near rest b, quadratic in them, would else contradict itself.
-  const double least_size = level.first == system_.layout().q(0) ? 1 : 0;
+  const bool are_positions = level.first == system_.layout().q(0);
   double previous = std::numeric_limits<double>::infinity();
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     const SystemValues values = system_.evaluate(state, parameters_);
@@ -116,6 +115,9 @@ bool ConstraintProjection::newton(const Level& level, VectorXd& state) const {
 
     // |c| against what a relative change of x makes of it
     const VectorXd x = state.segment(level.first, system_.nq()).cwiseAbs();
+    // Velocities are brought to rounding of their own size, since near rest b, quadratic in them, would else contradict itself; one of
+    // them may be 0 but for rounding of the others.
+    const double least_size = are_positions ? 1 : std::numeric_limits<double>::epsilon() * x.maxCoeff();
     const VectorXd scale = A.cwiseAbs() * x.cwiseMax(least_size);
     if ((c.array().abs() <= at_rounding * scale.array()).all()) return iteration > 0;
     const VectorXd coarse_scale = A.cwiseAbs() * x.cwiseMax(1);

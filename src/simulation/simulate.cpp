@@ -143,7 +143,14 @@ class Integration {
       step = to_limit ? std::max(step, tried) : tried;
       constexpr double growth = 1.5;
       step = std::min(step, longest_holding_step_ *= growth);
-      write_within(next, crossing.value_or(t_new), t_new);
+      const Index first = next;
+      if (!write_within(next, crossing.value_or(t_new), t_new)) {
+        next = first;
+        step = (t_new - t_) / 2;
+        --out_.steps;
+        ++out_.rejected_steps;
+        continue;
+      }
       if (crossing) {
         x_new_ = x_crossing_;
         t_new = *crossing;
@@ -458,9 +465,13 @@ class Integration {
     }
   }
 
-  // the times before `end`, from the dense output of the step to t_new
-  void write_within(Index& next, double end, double t_new) {
+  // The times before `end`, from the dense output of the step to t_new. False where its stages missed something: a force that acts for
+  // a few rows between them.
+  bool write_within(Index& next, double end, double t_new) {
     Phase x(x_.size()), dxdt(x_.size());
+    constexpr Index few = 3;  // rows that a step may well leave to its error estimate
+    const bool is_plain = switching_.is_empty() && contacts_.is_empty() && conditions_.empty();
+    const bool is_long = next + few <= options_.times.size() && options_.times[next + few - 1] < end;
     for (; next < options_.times.size() && options_.times[next] < end; ++next) {
       const double t = options_.times[next];
       stepper_.stepper().calc_state(t, x, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
@@ -470,8 +481,25 @@ class Integration {
       } catch (const StageFault& fault) {
         stop(t, fault.text);
       }
+      if (is_plain && is_long && is_missed(t, dxdt, t_new)) return false;
       write(next, t, x, dxdt);
     }
+    return true;
+  }
+
+  // whether the velocities of the step change at t far otherwise than the accelerations there say
+  [[nodiscard]] bool is_missed(double t, const Phase& dxdt, double t_new) {
+    constexpr double share = 1e-3, far = 1e4;  // of the step; tolerances
+    const double h = t_new - t_, before = std::max(t_, t - share * h), after = std::min(t_new, t + share * h);
+    Phase from(x_.size()), to(x_.size());
+    stepper_.stepper().calc_state(before, from, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
+    stepper_.stepper().calc_state(after, to, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
+    for (auto k = static_cast<std::size_t>(layout_.nq); k < 2 * static_cast<std::size_t>(layout_.nq); ++k) {
+      const double rate = (to[k] - from[k]) / (after - before);
+      const double tolerance = options_.absolute_tolerance + options_.relative_tolerance * (std::abs(x_[k]) + h * std::abs(rate));
+      if (std::abs(dxdt[k] - rate) * h > far * tolerance) return true;
+    }
+    return false;
   }
 
   void advance(double t_new, bool has_crossed) {
@@ -597,8 +625,9 @@ class Integration {
   // Δdq of an impact with friction, whose gaps open at rates that change evenly by r: a motion of the velocities alone, within a
   // time so short that no surface moves, under loads so large that no other force counts (theory.md, T49).
   VectorXd jump(const VectorXd& at, const VectorXd& r) {
-    constexpr double duration = 1e-12, large = 1e3 / duration, same = 1e-6;
+    constexpr double duration = 1e-12, same = 1e-6;
     if (r.isZero(0)) return VectorXd::Zero(layout_.nq);
+    const double large = 1e3 / duration / r.norm();
     const auto between = [this, &r](double less, double more) -> Acceleration {
       return [below = options_.pushed(less * r), above = options_.pushed(more * r), scale = duration * (more - less)](
                  const Ref<const VectorXd>& state) -> VectorXd { return (above(state) - below(state)) / scale; };

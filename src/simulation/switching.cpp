@@ -18,6 +18,21 @@ namespace {
 // Where the constraints hardly let the motion leave a surface, as a slider at its dead centre, its sides hardly act on the motion.
 constexpr double least_way_out = 1e-4;
 
+// The least x for A x = b. Surfaces that are one, as those of two feet of a box that stands flat, are so up to rounding alone, and no
+// difference between them is to be divided by.
+VectorXd least_solution(MatrixXd A, VectorXd b) {
+  constexpr double alike = 1e-6;  // rows of length 1
+  for (Index k = 0; k < A.rows(); ++k) {
+    const double length = A.row(k).norm();
+    if (!(length > 0)) continue;
+    A.row(k) /= length;
+    b[k] /= length;
+  }
+  Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
+  decomposition.setThreshold(alike);
+  return decomposition.compute(A).solve(b);
+}
+
 }  // namespace
 
 Switching::Switching(const SwitchingFunctions& functions, VectorXd parameters, StateLayout layout, double tolerance)
@@ -86,8 +101,8 @@ VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const Vecto
   for (Index k = 0; k < along.rows(); ++k) {
     if (along.row(k).norm() <= least_way_out * normals.row(k).norm()) along.row(k).setZero();
   }
-  state.segment(layout_.dq(0), layout_.nq) += T * along.completeOrthogonalDecomposition().solve(Eigen::Map<const VectorXd>(
-                                                      changes.data(), static_cast<Index>(rows.size())));
+  state.segment(layout_.dq(0), layout_.nq) +=
+      T * least_solution(std::move(along), Eigen::Map<const VectorXd>(changes.data(), std::ssize(changes)));
   if (constraints_) constraints_(state);
   return state;
 }
@@ -289,7 +304,7 @@ VectorXd Switching::acceleration_along(const Surfaces& surfaces, const Values& v
       share(open) = solved;
       const VectorXd rest = (drift + normals * mixture(values, share))(open);
       const MatrixXd slope = (normals * slopes(values, share))(open, open);
-      const VectorXd change = slope.completeOrthogonalDecomposition().solve(rest);
+      const VectorXd change = least_solution(slope, rest);
       solved += change;
       if (values.corners.size() == 0 || change.norm() <= enough) break;
       solved = solved.cwiseMax(-farthest).cwiseMin(2 + farthest);

@@ -132,8 +132,9 @@ class JumpsOf {
 
   // of a square, or of one times what reads no velocity; right operands first, which are short where a text has many
   std::optional<Expression> root_of(const Expression& e) {
-    if (e.operation() == Operation::power && e.right().is_constant(2)) return e.left();
-    if (e.operation() == Operation::multiply && e.left() == e.right()) return e.left();
+    const auto without_abs = [](const Expression& base) { return base.operation() == Operation::abs ? base.left() : base; };
+    if (e.operation() == Operation::power && e.right().is_constant(2)) return without_abs(e.left());
+    if (e.operation() == Operation::multiply && e.left() == e.right()) return without_abs(e.left());
     const bool is_product = e.operation() == Operation::multiply;
     if (!is_product && e.operation() != Operation::divide) return std::nullopt;
     const bool is_square_left = !reads_velocity(e.right());

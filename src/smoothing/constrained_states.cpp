@@ -155,10 +155,11 @@ int ConstrainedStates::redundancy(const VectorXd& state) const {
     find_open(velocity_rows_, free_, [](const Coordinate& coordinate) { return coordinate.velocity(); });
   }
   if (!open.empty()) {
-    throw InputError(
-        fmt::format("the log has no column for {0}, and the constraints of '{1}' do not decide {2} from what it has; log {0}, or "
-                    "name its column with `map=LOGNAME={0}`",
-                    fmt::join(open, ", "), system_.name(), open.size() > 1 ? "them" : "it"));
+    throw InputError(fmt::format(
+        "the log has no column for {}, and the constraints of '{}' do not decide {} from what it has; log {}{}, or "
+        "name {} with `map=LOGNAME={}`",
+        fmt::join(open, ", "), system_.name(), open.size() > 1 ? "them" : "it", open.size() > 1 ? "one or more of " : "",
+        fmt::join(open, ", "), open.size() > 1 ? "their columns" : "its column", open.front()));
   }
   return static_cast<int>(rank_of(A) - rank_of(A(Eigen::all, free_)));
 }

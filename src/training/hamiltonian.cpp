@@ -59,7 +59,12 @@ class Chain {
         workspace_(workers, stop),
         x_(start.x),
         gradient_(VectorXd::Zero(x_.size())) {
-    J_ = objective_(x_, &gradient_, workspace_);
+    const std::vector<Hyperparameter>& all = objective.hyperparameters();
+    for (std::size_t k = 0; k < all.size(); ++k) {
+      if (all[k].hyperprior.form == HyperPrior::Form::log_normal && !all[k].map().is_logarithm)
+        logarithms_.push_back({static_cast<Index>(k), all[k].map()});
+    }
+    J_ = energy(x_, gradient_);
   }
 
   static constexpr int longest = 25;  // leapfrog steps of one step
@@ -79,7 +84,7 @@ class Chain {
     for (int k = 0; k < n && J < before + hopeless; ++k) {
       p -= 0.5 * length * (W_.transpose() * gradient);
       const bool has_arrived = drift(length, x, p);
-      J = has_arrived ? objective_(x, &gradient, workspace_) : std::numeric_limits<double>::infinity();
+      J = has_arrived ? energy(x, gradient) : std::numeric_limits<double>::infinity();
       ++evaluations_;
       p -= 0.5 * length * (W_.transpose() * gradient);
     }
@@ -94,10 +99,29 @@ class Chain {
   StepLength& length() { return length_; }
 
   [[nodiscard]] const VectorXd& x() const { return x_; }
-  [[nodiscard]] double objective() const { return J_; }
+  [[nodiscard]] double objective() const { return J_ - log_measure(x_); }
   [[nodiscard]] int evaluations() const { return evaluations_; }
 
  private:
+  /// A value that is sampled itself, though its density is normal in its logarithm: that has 1/v in v.
+  struct OfLogarithm {
+    Index k;
+    CoordinateMap map;
+  };
+
+  [[nodiscard]] double log_measure(const VectorXd& x) const {
+    double sum = 0;
+    for (const OfLogarithm& one : logarithms_) sum += std::log(one.map.value(x[one.k]));
+    return sum;
+  }
+
+  /// −log of the density of x
+  double energy(const VectorXd& x, VectorXd& gradient) {
+    const double J = objective_(x, &gradient, workspace_);
+    for (const OfLogarithm& one : logarithms_) gradient[one.k] += one.map.logarithm_slope(one.map.value(x[one.k]));
+    return J + log_measure(x);
+  }
+
   // x + t W p, mirrored in the metric at each wall of the box that is met; false where walls are met without end
   bool drift(double t, VectorXd& x, VectorXd& p) const {
     constexpr int most = 100;
@@ -127,6 +151,7 @@ class Chain {
   const VectorXd &lower_, &upper_;
   RandomStream random_;
   Likelihood::Workspace workspace_;
+  std::vector<OfLogarithm> logarithms_;
   VectorXd x_, gradient_;
   double J_ = 0;
   StepLength length_;

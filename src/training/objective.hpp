@@ -41,6 +41,7 @@ class Objective {
   /// @param gradient  in x, of the size of x; not computed when null; left as it was when the value is +∞
   double operator()(const Eigen::VectorXd& x, Eigen::VectorXd* gradient, Likelihood::Workspace& workspace) const;
 
+  [[nodiscard]] const std::vector<Hyperparameter>& hyperparameters() const { return hyperparameters_; }
   /// The hyperparameters at x.
   [[nodiscard]] std::vector<Hyperparameter> at(const Eigen::VectorXd& x) const;
 

@@ -33,10 +33,10 @@ TEST(DeriveCommand, MakesOfAnEncoderLogWhatFitNeeds) {
   desk.write("log.csv", encoder_log(desk));
   const Outcome outcome =
       desk.done("gp2 derive log.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv");
-  EXPECT_TRUE(outcome.said("q3 is the column 'theta1'")) << outcome.err;
-  EXPECT_TRUE(outcome.said("t is the column 'time'"));
+  EXPECT_TRUE(outcome.said("column 'theta1' taken as q3")) << outcome.err;
+  EXPECT_TRUE(outcome.said("column 'time' taken as t"));
   EXPECT_TRUE(outcome.said("from the constraints: q1, q2, q4, q5"));
-  EXPECT_TRUE(outcome.said("q6: 402 samples; lengthscale"));
+  EXPECT_TRUE(outcome.said("q6: 402 samples at "));
   EXPECT_TRUE(outcome.said("resolution 0.0001"));
   EXPECT_TRUE(outcome.said("data.csv: 402 rows, 2 episodes; independent accelerations: ddq3, ddq6"));
   const CsvTable data = desk.table("data.csv");

@@ -113,6 +113,7 @@ TEST(Csv, AHeaderWithoutNamesOrWithOneNameTwiceIsRefused) {
 TEST(Csv, OtherSeparatorsAreRefusedByName) {
   EXPECT_THAT(input_error_of([] { parse("q1;q2\n1,5;2\n"); }), HasSubstr("not separated by commas but by ';'"));
   EXPECT_THAT(input_error_of([] { parse("q1\tq2\n1\t2\n"); }), HasSubstr("not separated by commas but by 'tab'"));
+  EXPECT_THAT(input_error_of([] { parse("t q1 q2\n0 1 2\n"); }), HasSubstr("not separated by commas but by 'space'"));
 }
 
 TEST(Csv, AFileWithoutDataIsRefused) {

@@ -14,7 +14,6 @@ using test::input_error_of;
 using testing::ElementsAre;
 using testing::HasSubstr;
 using testing::IsEmpty;
-using testing::Pair;
 
 /// A system with these coordinates (as TOML) and the inputs u1, u2 and u.
 Model model_of(const std::string& coordinates) {
@@ -82,7 +81,7 @@ TEST_F(LogReaderTest, FindsColumnsInAnyOrderAndReportsThoseItLeaves) {
   EXPECT_TRUE(states.bottomRows(4).array().isNaN().all());
   EXPECT_EQ(reader.values({"ddq1"}), Eigen::RowVector2d(7, 8));
   EXPECT_THAT(reader.unused_columns(), ElementsAre("remark", "t"));
-  EXPECT_THAT(reader.aliases_used(), IsEmpty());
+  EXPECT_THAT(reader.notes(), IsEmpty());
 }
 
 TEST_F(LogReaderTest, ReadsSeveralValuesInTheOrderAskedFor) {
@@ -103,8 +102,22 @@ TEST_F(LogReaderTest, SaysWhichOtherNamesItTook) {
   const CsvTable table = CsvTable::parse("q1,v1,time\n1,2,3\n", "log.csv");
   LogReader reader(table, *model.system);
   static_cast<void>(reader.states({true, false, true, false, true, false, false, false}));
-  EXPECT_THAT(reader.aliases_used(), ElementsAre(Pair("dq1", "v1"), Pair("t", "time")));
+  EXPECT_THAT(reader.notes(), ElementsAre("column 'v1' taken as dq1", "column 'time' taken as t"));
   EXPECT_THAT(reader.unused_columns(), IsEmpty());
+}
+
+TEST_F(LogReaderTest, WarnsOfAGivenColumnThatIsMissingWhereOthersAreThere) {
+  const auto notes_of = [&](const std::string& header) {
+    const CsvTable table = CsvTable::parse(header + "\n1,2\n", "log.csv");
+    LogReader reader(table, *model.system, {{"q1", "theta"}, {"q2", "phi"}});
+    static_cast<void>(reader.states({true, true, false, false, false, false, false, false}));
+    return reader.notes();
+  };
+  EXPECT_THAT(notes_of("theta,phi"), ElementsAre("column 'theta' taken as q1", "column 'phi' taken as q2"));
+  EXPECT_THAT(notes_of("q2,theta"),
+              ElementsAre("warning: log.csv: no column 'phi', which is to be q2: column 'q2' is read instead",
+                          "column 'theta' taken as q1"));
+  EXPECT_THAT(notes_of("q1,q2"), IsEmpty());
 }
 
 TEST_F(LogReaderTest, PrefersTheNameItselfToOtherNames) {

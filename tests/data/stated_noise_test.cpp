@@ -258,6 +258,20 @@ TEST(StatedNoise, WeighsTheValuesOfAFit) {
   EXPECT_GT(worst_error(blind), 0.2);
 }
 
+TEST(StatedNoise, IsStatedWhateverItsUnit) {
+  for (const double stddev : {0.5, 1.0, 2.0}) {
+    std::string text = "x,y,dx,dy,ddx,ddx_std\n";
+    for (int i = 0; i < 20; ++i) {
+      const double x = 0.1 * i, dx = std::sin(0.7 * i);
+      text += fmt::format("{},{},{},{},{},{}\n", x, x / 2, dx, dx / 2, std::cos(1.3 * i), stddev * (1 + i % 3));
+    }
+    FitProblemOptions options;
+    options.observe = {"ddx"};
+    const FitProblem problem = make_fit_problem(slope_with(), CsvTable::parse(text, "log.csv"), options);
+    EXPECT_TRUE(problem.observations.front().states_noise(0)) << stddev;
+  }
+}
+
 TEST(StatedNoise, WeighsTheValuesOfABaseline) {
   FitProblemOptions options;
   options.baseline = Baseline::Kind::se;

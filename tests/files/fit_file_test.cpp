@@ -734,7 +734,7 @@ TEST_F(DamagedFit, ValuesOutOfPlaceAreNamed) {
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["rows"] = {0, 1, 1}; }), "row 1 of a view stands twice");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["rows"] = Json::array(); }), "a view without rows");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["view"] = "velocity"; }), "'velocity' is no view");
-  EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = 0; }), "0 observations are not possible");
+  EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = -1; }), "-1 observations are not possible");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = 2000000000; }), "'ddq1' has 6 values, expected 2000000000");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = 1e18; }), "1e+18 stands where a whole number must");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["states"]["dq1"][3] = nullptr; }), "null stands where a number must");

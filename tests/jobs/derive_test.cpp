@@ -499,7 +499,101 @@ TEST(Derive, VelocitiesOfTheLogAreUsed) {
   const DerivedData with = derive(cart(), cart_log(with_velocity, {"t", "q1", "qd1"}));
   EXPECT_LT(with.stddev.row(2).mean(), 0.5 * without.stddev.row(2).mean());
   EXPECT_NEAR(with.accelerations(0, 50), -9 * std::sin(1.5), 0.05);
-  EXPECT_THAT(with.notes, Contains("dq1 is the column 'qd1'"));
+  EXPECT_THAT(with.notes, Contains("column 'qd1' taken as dq1"));
+}
+
+TEST(Derive, VelocitiesThatAreNoRatesAreLeftOutAndSaid) {
+  const DerivedData without = derive(cart(), cart_log());
+  for (const double factor : {180 / std::numbers::pi, -1.0}) {
+    const DerivedData with =
+        derive(cart(), cart_log(
+                           [&](std::vector<Row>& rows) {
+                             for (std::size_t k = 0; k < rows.size(); ++k)
+                               rows[k].push_back(shortest(factor * 3 * std::cos(0.03 * static_cast<double>(k))));
+                           },
+                           {"t", "q1", "dq1"}));
+    EXPECT_THAT(with.notes, Contains(HasSubstr("warning: log.csv: dq1 is not the rate of q1 over t: the rate is ")));
+    EXPECT_TRUE(with.accelerations == without.accelerations);
+    EXPECT_FALSE(with.series.front().has_velocities);
+  }
+}
+
+// the root mean square by which derived positions of cart_log are off, in deviations
+double error_in_deviations(const DerivedData& data) {
+  double sum = 0;
+  for (Index i = 0; i < data.states.cols(); ++i)
+    sum += std::pow((data.states(0, i) - std::sin(3 * data.states(2, i))) / data.stddev(0, i), 2);
+  return std::sqrt(sum / static_cast<double>(data.states.cols()));
+}
+
+TEST(Derive, AValueThatIsHeldForSeveralRowsIsOneSample) {
+  for (const std::size_t held : {2U, 4U}) {
+    const DerivedData data = derive(cart(), cart_log([&](std::vector<Row>& rows) {
+                                      for (std::size_t k = 0; k < rows.size(); ++k) rows[k][1] = rows[k - k % held][1];
+                                    }));
+    EXPECT_THAT(data.notes, Contains(HasSubstr(fmt::format("each value stands in {} rows", held))));
+    EXPECT_LT(error_in_deviations(data), 2);
+  }
+  // an encoder's steps are no such thing
+  const DerivedData coarse = derive(cart(), cart_log([](std::vector<Row>& rows) {
+                                      for (Row& row : rows) row[1] = shortest(std::round(std::stod(row[1]) / 0.05) * 0.05);
+                                    }));
+  EXPECT_EQ(coarse.series.front().repeated, 0);
+}
+
+TEST(Derive, AStuckSensorIsSaidAlsoWhereItStaysSo) {
+  const auto notes = derive(cart(), cart_log([](std::vector<Row>& rows) {
+                              for (std::size_t k = 150; k < rows.size(); ++k) rows[k][1] = rows[149][1];
+                            }))
+                         .notes;
+  EXPECT_THAT(notes, Contains(HasSubstr("q1 is the same in 51 samples, from t = 1.49 to 1.99, although it has noise")));
+}
+
+TEST(Derive, WrongAndMissingValuesOfAnInputAreSaid) {
+  const auto notes_of = [](const std::function<void(std::vector<Row>&)>& edit) {
+    return derive(cart(), cart_log(
+                              [&](std::vector<Row>& rows) {
+                                for (std::size_t k = 0; k < rows.size(); ++k)
+                                  rows[k].push_back(shortest(std::sin(0.05 * static_cast<double>(k))));
+                                edit(rows);
+                              },
+                              {"t", "q1", "u1"}))
+        .notes;
+  };
+  EXPECT_THAT(notes_of([](auto&) {}), testing::Not(Contains(HasSubstr("input"))));
+  EXPECT_THAT(notes_of([](auto& rows) { rows[77][2] = "500"; }),
+              Contains(HasSubstr("single values of the input u1 lie far from all "
+                                 "others: 500 at row 78")));
+  EXPECT_THAT(notes_of([](auto& rows) {
+                for (std::size_t k = 120; k < rows.size(); ++k) rows[k][2] = "";
+              }),
+              Contains(HasSubstr("warning: log.csv: the input u1 has no value for 0.8 s, from t = 1.19 on")));
+}
+
+TEST(Derive, TheUsualStepIsThatOfThePositionsWhereOtherColumnsHaveRowsOfTheirOwn) {
+  const DerivedData data = derive(cart(), cart_log(
+                                              [](std::vector<Row>& rows) {
+                                                std::vector<Row> joined;
+                                                for (const Row& row : rows) {
+                                                  joined.push_back({row[0], row[1], ""});
+                                                  joined.push_back({shortest(std::stod(row[0]) + 4e-6), "", "1"});
+                                                }
+                                                rows = joined;
+                                              },
+                                              {"t", "q1", "u1"}));
+  EXPECT_LT(error_in_deviations(data), 2);
+  EXPECT_THAT(data.notes, testing::Not(Contains(HasSubstr("warning"))));
+}
+
+TEST(Derive, ColumnsThatAreNotReadAreNamed) {
+  const DerivedData data = derive(cart(),
+                                  cart_log(
+                                      [](std::vector<Row>& rows) {
+                                        for (Row& row : rows) row.insert(row.end(), {"1", "2"});
+                                      },
+                                      {"t", "q1", "w1", "mark"}),
+                                  {.keep = {"mark"}});
+  EXPECT_THAT(data.notes, Contains("log.csv: columns not needed: w1"));
 }
 
 TEST(Derive, InputsGoThroughTheFilterOfThePositions) {

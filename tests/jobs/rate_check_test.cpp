@@ -225,6 +225,21 @@ TEST(RateNotes, OfAFitDoNotNeedAModelThatReadsTheTime) {
   EXPECT_THAT(rate_notes_of_fit(1, 1, "noon"), IsEmpty());
 }
 
+TEST(WrongRates, AreNamedWhereARowIsThereTwiceOrAnEpisodeBeginsAnew) {
+  const Model model = Model::parse("coordinates = [\"x\"]\n[mechanics]\nmass = [[\"1\"]]\nforce = [\"0\"]\n", "mass");
+  for (const bool is_episode : {false, true}) {
+    Eigen::MatrixXd states(3, 400);  // x, dx, t
+    for (Index i = 0; i < states.cols(); ++i) {
+      const Index row = is_episode ? i % 200 : std::min<Index>(i, 300);
+      const double t = 0.02 * static_cast<double>(row);
+      states.col(i) << std::sin(3 * t), -3 * std::cos(3 * t), t;
+    }
+    const Index n = is_episode ? 400 : 303;
+    const auto notes = wrong_rates(*model.system, states.leftCols(n), Eigen::MatrixXd::Constant(1, n, std::nan("")), true);
+    EXPECT_THAT(notes, testing::ElementsAre(HasSubstr("a wrong sign"))) << is_episode;
+  }
+}
+
 TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {
   std::mt19937 random(3);
   std::normal_distribution<double> normal(0, 1);

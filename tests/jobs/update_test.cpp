@@ -14,6 +14,7 @@
 #include "data_of_model.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "inference/problems.hpp"
 #include "input_error.hpp"
 #include "io_testing.hpp"
 #include "test_models.hpp"
@@ -101,6 +102,40 @@ TEST(UpdateJob, AWindowLeavesTheNewest) {
   const UpdateOutcome updated = update(fit, {log}, request);
   EXPECT_EQ(updated.n_states, 8);
   EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(8));
+}
+
+// the file of a fit numbers its states anew, log after log
+TEST(UpdateJob, AWindowLeavesTheNewestOfSeveralLogsToo) {
+  FitRequest request = test::fit_request(test::model(surface), {log_of(10, 1), log_of(12, 2)});
+  request.max_iterations = 0;
+  FitFile fit = run_fit(prepare_fit(std::move(request))).file;
+  const test::TemporaryFolder folder;
+  UpdateRequest newest;
+  newest.window = 15;
+  for (const std::uint64_t seed : {3U, 4U, 5U}) {
+    fit = update(std::move(fit), {log_of(10, seed)}, newest).fit;
+    fit.write(folder / "fit.json");
+    fit = FitFile::read(folder / "fit.json");
+  }
+  const MatrixXd before = more_of(fit, log_of(10, 4)).values().rightCols(5), last = more_of(fit, log_of(10, 5)).values();
+  MatrixXd wanted(before.rows(), 15), left(before.rows(), 0);
+  wanted << before, last;
+  for (const Observations& group : fit.observations) {
+    left.conservativeResize(Eigen::NoChange, left.cols() + group.n_data());
+    left.rightCols(group.n_data()) = group.values();
+  }
+  ASSERT_EQ(left.cols(), 15);
+  EXPECT_EQ(left, wanted);
+}
+
+TEST(UpdateJob, AWindowKeepsWhatIsDistrustedAmongTheNewest) {
+  FitFile fit = fit_of(log_of(30, 1));
+  fit.report.distrusted = {{.group = 0, .row = 0, .state = 3}, {.group = 0, .row = 0, .state = 25}};
+  UpdateRequest request;
+  request.window = 20;
+  const UpdateOutcome updated = update(fit, {log_of(5, 2)}, request);
+  ASSERT_EQ(updated.fit.report.distrusted.size(), 1U);
+  EXPECT_EQ(updated.fit.report.distrusted.front().state, 10);
 }
 
 // of every draw of the hyperparameters, each with a noise of its own
@@ -298,11 +333,18 @@ TEST(UpdateJob, OfSeveralLogsTheLargestNoiseIsTakenAndSaid) {
     for (int i = 0; i < 40; ++i) rough += fmt::format("{},0,{},0.3,{}\n", 0.01 * i, 0.05 * i, 2 * std::sin(31.0 * i));
     std::vector<CsvTable> logs = {block_log("fine.csv", 40, -1, "")};
     logs.insert(is_first ? logs.begin() : logs.end(), CsvTable::parse(rough, "rough.csv"));
-    const FitFile fit = fit_of_block(block("0.1"), std::move(logs), true);
+    const Model model = Model::parse(test::changed(block("0.1").text, {{R"({ force = [["1"]] })", R"("force")"}}), "block.toml");
+    const FitFile fit = fit_of_block(model, std::move(logs), true);
+    const auto leads =
+        std::ranges::find_if(fit.report.hyperparameters, [](const Hyperparameter& h) { return !h.followers.empty(); });
+    ASSERT_NE(leads, fit.report.hyperparameters.end());
+    EXPECT_EQ(leads->owner, is_first ? 1 : 0) << "the discrepancy goes with the log that has less noise";
     const Posterior before = fit.posterior();
     std::vector<std::string> notes;
     const Observations more = more_observations(fit, before, block_log("more.csv", 5, -1, ""), {}, notes);
-    EXPECT_EQ(more.noise().stddev()[0], std::max(before.noise_stddev(0)[0], before.noise_stddev(1)[0]));
+    const double a = before.noise_stddev(0)[0], b = before.noise_stddev(1)[0];
+    EXPECT_EQ(more.noise().stddev()[0], std::max(a, b));
+    EXPECT_NEAR(measurement_noise(before, {0}, 1, {})(0, 0), std::sqrt((a * a + b * b) / 2), 1e-12) << "of as many rows each";
     EXPECT_THAT(notes, Contains(HasSubstr("warning: more.csv: the logs of the fit differ in noise, ddx from ")));
   }
 }

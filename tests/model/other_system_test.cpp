@@ -96,7 +96,18 @@ TEST(MakeSetting, NamesWhatDiffers) {
   EXPECT_EQ(refused(with(&BeadText::directions, R"("force")")),
             rule + "the directions of its latent 1, 'drag', are \"force\" there, but \"acceleration\" here");
   EXPECT_EQ(refused(with(&BeadText::directions, R"([["dx"], ["dy"]])")),
-            rule + "the directions of its latent 1, 'drag', are 1 of its own there, but \"acceleration\" here");
+            rule + "the directions of its latent 1, 'drag', are 1 of its own (accelerations) there, but \"acceleration\" here");
+  const Model along = with(&BeadText::directions, R"([["dx"], ["dy"]])").model("home.toml");
+  const Model by_force = with(&BeadText::directions, R"({ force = [["dx"], ["dy"]] })").model("other.toml");
+  EXPECT_EQ(
+      input_error_of([&] { make_other_system(along, by_force); }),
+      rule + "the directions of its latent 1, 'drag', are 1 of its own (forces) there, but 1 of its own (accelerations) here");
+  const Model two = with(&BeadText::extra, "[[latent]]\nname = \"lift\"\nkernel = \"se\"\nfeatures = [\"x\"]").model("home.toml");
+  std::string swapped = std::regex_replace(two.text, std::regex("\"drag\""), "\"none\"");
+  swapped = std::regex_replace(swapped, std::regex("\"lift\""), "\"drag\"");
+  swapped = std::regex_replace(swapped, std::regex("\"none\""), "\"lift\"");
+  EXPECT_EQ(input_error_of([&] { make_other_system(two, Model::parse(swapped, "other.toml")); }),
+            rule + "its latents are lift, drag there, but drag, lift here");
   // --prior replaces the directions of both
   EXPECT_EQ(refused(with(&BeadText::directions, R"("force")"), {Prior::Mean::zero, Latent::Base::force, false, {}}), "");
 }

@@ -80,7 +80,7 @@ def oscillator():
 
 
 def columns_of(table):
-    return {name: table[name] for name in table.keys()}
+    return {name: table[name].copy() for name in table.keys()}
 
 
 def write_csv(path, table):

@@ -103,8 +103,9 @@ def test_two_predictions_share_no_memory(posterior, arm_states):
 
 def test_a_motion_and_mechanics_share_no_memory_with_what_they_come_from(posterior, arm, arm_states):
     motion = posterior.simulate({"shoulder": 0.9}, [0, 0.1])
-    motion.q[:] = np.nan
-    assert np.isfinite(motion.q).all()
+    found = posterior.inverse_dynamics(arm_states, np.zeros((len(arm_states), 2)))
+    for copied in (motion.t, motion.states, motion.q, motion.dq, motion.ddq, motion.std, motion.multipliers, found.inputs, found.cov):
+        refuses(lambda copied=copied: copied.fill(np.nan), ValueError, "read-only")  # it would be lost
     mechanics = arm.evaluate(arm_states)
     kept = mechanics.A.copy()
     del arm_states
@@ -198,8 +199,19 @@ def test_numbers_that_are_not_finite_are_refused_where_they_are_read(posterior, 
         states[4, 1] = value
         refuses(
             lambda states=states: posterior.predict(states), gp2.InputError,
-            f"states: row 4, column 1 (elbow): {value} is not a finite number",
+            f"states: row 5, column 2 (elbow): {value} is not a finite number",
         )  # fmt: skip
+
+
+def test_evaluate_refuses_a_state_without_what_the_equations_read():
+    cart = gp2.System(coordinates=["x"], inputs=["u"], mass=[["1"]], force=["u"], latents=[{"features": ["dx"]}], noise=0.1)
+    table = {"x": [0.0, 1.0], "dx": [2.0, 3.0]}
+    refuses(lambda: cart.evaluate(table), gp2.InputError, "states: row 1 has no 'u', which M, A, b or F read")
+    states = cart.states(table)
+    assert np.isnan(states[:, 2:]).all()
+    states[0, 3] = 5.0
+    refuses(lambda: cart.evaluate(states), gp2.InputError, "states: row 2 has no 'u'")
+    assert cart.evaluate(states[:1]).F == 5.0  # t is not read
 
 
 def test_numbers_that_nothing_reads_may_be_anything(oscillator):

@@ -1,6 +1,8 @@
 """Systems whose mechanics are Python functions."""
 
+import concurrent.futures
 import sys
+import time
 import types
 
 import gp2
@@ -157,10 +159,65 @@ def test_fit_is_saved_without_the_functions_and_loaded_with_them(surface, log, t
 
 
 def test_several_threads_take_turns_in_the_functions(surface, log):
-    system = as_functions(surface, parameters=parameters(p1={"value": 0.08, "bounds": [0.06, 0.1]}))
+    """Functions with a state of their own, which give wrong numbers if another thread comes in between."""
+    buffer = {}
+
+    def through_a_buffer(states, values):
+        buffer["states"], buffer["values"] = states.copy(), dict(values)
+        time.sleep(0)  # lets go of the interpreter's lock
+        at = surface.evaluate(buffer["states"], buffer["values"])
+        return at.M, at.A, at.b, at.F
+
+    bounded = parameters(p1={"value": 0.08, "bounds": [0.06, 0.1]})
+    systems = [as_functions(surface, mechanics=through_a_buffer, parameters=bounded) for _ in range(2)]
     options = {"estimate": ["p1"], "restarts": 3, "max_iterations": 5}
-    one, two = (gp2.fit(system, log, threads=threads, **options) for threads in (1, 2))
+    one, two = (gp2.fit(systems[0], log, threads=threads, **options) for threads in (1, 2))
     assert one.report.objective == two.report.objective
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        at_once = list(pool.map(lambda system: gp2.fit(system, log, threads=2, **options), systems))
+    assert [fit.report.objective for fit in at_once] == [one.report.objective] * 2
+
+
+def test_a_function_may_evaluate_another_system_of_functions(surface, log):
+    inner = as_functions(surface)
+
+    def mechanics(states, values):
+        at = inner.evaluate(states, values)
+        return at.M, at.A, at.b, at.F
+
+    outer = as_functions(surface, mechanics=mechanics)
+    likelihoods = [gp2.fit(system, log, max_iterations=0, threads=2).negative_log_likelihood for system in (inner, outer)]
+    assert likelihoods[0] == likelihoods[1]
+
+
+def test_masked_entries_of_what_a_function_returns_are_not_numbers():
+    def mechanics(states, values):
+        n = len(states)
+        force = np.ma.masked_array(np.full((n, 1), 7.0), mask=np.arange(n)[:, None] == 1)
+        return np.ones((n, 1, 1)), None, None, force
+
+    system = gp2.System.from_callables(mechanics, coordinates=["x"], noise=0.1, reads=["x", "dx"])
+    with pytest.raises(gp2.InputError, match="force F with a number that is not finite at state 2"):
+        system.evaluate(np.zeros((3, 3)))
+
+
+def test_what_is_wrong_with_the_call_is_said_whatever_keywords_the_system_has():
+    with pytest.raises(TypeError, match="^reads: expected a list of names, got 'x'$"):
+        gp2.System.from_callables(returning(None), reads="x", coordinates=["x"], noise=0.1)
+    with pytest.raises(TypeError, match=r"^from_callables\(\) is missing the argument 'mechanics'$"):
+        gp2.System.from_callables(coordinates=["x"], noise=0.1)
+    free = gp2.System.from_callables(
+        lambda states, _: (np.ones((len(states), 1, 1)), None, None, np.zeros((len(states), 1))), coordinates=["x"], latents=None)
+    assert free.coordinates == ["x"]
+
+
+def test_what_a_function_raises_carries_that_there_is_no_fit_yet(surface, log):
+    def stops(states, values):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stop:
+        gp2.fit(as_functions(surface, mechanics=stops), log, mean="force")
+    assert stop.value.posterior is None
 
 
 def test_more_rows_than_a_thread_takes_are_added():

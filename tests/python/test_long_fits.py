@@ -262,6 +262,17 @@ def test_a_warning_that_is_an_error_carries_the_fit(surface):
     assert caught.value.posterior.report.objective == fitted.report.objective
 
 
+def test_a_warning_that_is_an_error_carries_the_motion(posterior):
+    start = {"shoulder": 0.9, "dshoulder": 50.0}
+    with pytest.warns(UserWarning, match="leaves the region of the data"):
+        motion = posterior.simulate(start, [0, 0.1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning) as caught:
+            posterior.simulate(start, [0, 0.1])
+    np.testing.assert_array_equal(caught.value.motion.q, motion.q)
+
+
 def test_what_is_no_function_is_no_progress(surface, tmp_path):
     for call in (lambda: gp2.fit(surface, 3, progress=3), lambda: gp2.fit_raw(surface, 3, progress=3),
                  lambda: gp2.fit_again(tmp_path, progress=3)):  # before anything is read  # fmt: skip

@@ -21,6 +21,17 @@ def test_copy_of_a_posterior_keeps_its_data_when_the_other_grows(posterior, arm)
     assert other.n_data == posterior.n_data + 5
 
 
+def test_a_posterior_without_data_is_copied_but_not_saved(posterior, arm_states, tmp_path):
+    prior = posterior.without_data()
+    for other in (copy.copy(prior), copy.deepcopy([prior])[0]):
+        assert other is not prior
+        np.testing.assert_array_equal(other.predict(arm_states).cov, prior.predict(arm_states).cov)
+    for call in (lambda: prior.save(tmp_path / "prior.json"), lambda: pickle.dumps(prior)):
+        with pytest.raises(gp2.InputError, match="^a posterior without data is not saved: save the fit"):
+            call()
+    assert not (tmp_path / "prior.json").exists()
+
+
 def test_what_never_changes_is_its_own_copy_and_a_system_travels_as_text(arm, arm_log):
     for fixed in (arm, arm_log, gp2.Log(arm_log, arm), gp2.SideInformation("unconstrained", arm_log)):
         assert copy.copy(fixed) is fixed and copy.deepcopy([fixed])[0] is fixed
@@ -122,6 +133,7 @@ def test_what_holds_functions_cannot_be_pickled():
     for thing in [system, posterior]:
         with pytest.raises(TypeError, match="'a mass' cannot be pickled: it has functions, which are code"):
             pickle.dumps(thing)
+    assert copy.copy(posterior).negative_log_likelihood == posterior.negative_log_likelihood
 
 
 def test_texts_say_what_a_thing_is_and_pprint_takes_them(posterior, arm, arm_log):

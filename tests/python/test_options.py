@@ -27,6 +27,26 @@ def test_an_unknown_keyword_is_refused_with_the_nearest(arm, arm_log):
         gp2.fit(arm, arm_log, qqq=1)
     with pytest.raises(TypeError, match=r"System\(\) got an unexpected keyword argument 'unit'; did you mean 'units'\?"):
         gp2.System(coordinates=["x"], mass=[[1]], unit={"x": "m"})
+    for misspelt, keyword in {"progres": "progress", "comands": "commands", "alos": "also"}.items():
+        with pytest.raises(TypeError, match=f"unexpected keyword argument '{misspelt}'; did you mean '{keyword}'"):
+            gp2.fit(arm, arm_log, **{misspelt: None})
+    with pytest.raises(TypeError, match="'sistem'; did you mean 'system'"):
+        gp2.fit(arm, arm_log, max_iterations=0).simulate({"shoulder": 0.9}, [0, 0.1], sistem=arm)
+
+
+def test_arguments_that_are_something_else_are_named(arm, arm_log, posterior, arm_fit_file):
+    with pytest.raises(TypeError, match=r"^posterior: expected a gp2.Posterior \(gp2.load reads one from a file\), got 'fit.json'$"):
+        gp2.Predictor("fit.json")
+    with pytest.raises(TypeError, match=r"^fit\(\) takes a system and data, then keywords; of arrays write fit\(system, \(X, y\)\)$"):
+        gp2.fit(arm, arm_log, arm_log)
+    for call, name in {
+        lambda: gp2.load(3): "path",
+        lambda: posterior.save(3): "path",
+        lambda: posterior.export(3): "folder",
+        lambda: gp2.fit_again(arm_fit_file, checkpoint=3): "checkpoint",
+    }.items():
+        with pytest.raises(TypeError, match=f"^{name}: expected a path, got 3$"):
+            call()
 
 
 def test_a_truth_value_is_no_number_and_a_number_no_truth_value(arm, arm_log):

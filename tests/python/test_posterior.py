@@ -361,6 +361,21 @@ def test_inputs_move_the_motion(posterior):
     assert (pushed.q[-1] != posterior.simulate(start, times).q[-1]).any()
 
 
+def test_a_motion_starts_at_the_first_row_of_any_table(posterior, arm, arm_log):
+    columns = {name: arm_log[name][:3] for name in arm.state_names}
+    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    expected = posterior.simulate(gp2.Table(columns), [0, 0.1]).q
+    for start in (columns, {name: list(values) for name, values in columns.items()}, rows, np.asarray(rows)):
+        np.testing.assert_array_equal(posterior.simulate(start, [0, 0.1]).q, expected)
+    assert gp2.simulate(arm, {"shoulder": np.float64(0.9)}, [0, 0.1]).q[0, 0] == 0.9
+
+
+def test_a_system_that_a_file_does_not_need_is_refused(arm, arm_fit_file):
+    for call in (gp2.load, gp2.Posterior.load, gp2.fit_again):
+        with pytest.raises(gp2.InputError, match="^system: this fit is all text; to predict under another system, give it to predict"):
+            call(arm_fit_file, system=arm)
+
+
 @pytest.mark.parametrize(
     ("start", "times", "error", "text"),
     [

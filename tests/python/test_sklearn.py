@@ -126,7 +126,7 @@ def test_predictions_are_those_of_the_posterior_and_obey_the_constraint(model, t
     mechanics = WIRE.evaluate(X)
     assert np.abs(np.einsum("nij,nj->ni", mechanics.A, mean) - mechanics.b).max() < 1e-13
     assert model.score(X, y) > 0.99
-    assert model.log_marginal_likelihood_value_ == -model.posterior_.negative_log_likelihood
+    assert model.log_marginal_likelihood_value_ == -model.posterior_.report.negative_log_likelihood
     assert model.n_features_in_ == 6 and model.outputs_ == ["ddx", "ddz"]
 
 
@@ -346,6 +346,16 @@ def test_a_scaler_before_a_system_is_warned_of(data, scaler):
         warnings.simplefilter("error")
         estimator.fit(X, y)
         make_pipeline(scaler, GP2Regressor(n_restarts=1, max_iterations=0)).fit(X, y)  # without mechanics it may be
+
+
+def test_an_input_that_acts_late_is_warned_of():
+    cart = gp2.System(
+        coordinates=["x"], inputs=[{"name": "u", "delay": {"estimate": True}}, {"name": "v", "lag": 0.1}, "w"], mass=[["1"]],
+        force=["u + v + w"], latents=[{"features": ["dx"]}], noise=0.1)
+    assert cart.late_inputs == ["u", "v"] and WIRE.late_inputs == []
+    X = np.random.default_rng(1).normal(size=(20, len(cart.state_names)))
+    with pytest.warns(UserWarning, match="^system: u, v: acts later than it is commanded. Rows of X are taken as what acts"):
+        GP2Regressor(cart, max_iterations=0, n_restarts=1).fit(X, X[:, 1])
 
 
 # ---------------------------------------------------------------- what is refused

@@ -692,6 +692,71 @@ TEST(ContactFriction, OfTwoContactsHoldsToTheLimitOfEach) {
   }
 }
 
+// on two feet, or on the left one alone
+Model box(double mu, bool has_right_foot) {
+  return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "z", "a"]
+inputs      = ["l", "r"]
+[parameters]
+w = 0.3
+h = 0.2
+[mechanics]
+mass      = [["2", "0", "0"], ["0", "2", "0"], ["0", "0", "0.05"]]
+force     = ["0", "-2*9.81", "0"]
+potential = "2*9.81*z"
+[constraints]
+position = [{{ expr = "z - h*cos(a) - w*sin(a)", contact = "l", name = "L" }}{0}]
+[let]
+vl = "dx + h*cos(a)*da - w*sin(a)*da"
+vr = "dx + h*cos(a)*da + w*sin(a)*da"
+fl = "-{2}*abs(lambda(L))*sign(vl)"
+fr = "{1}"
+[truth]
+force = ["fl + fr", "0", "(h*cos(a) - w*sin(a))*fl + (h*cos(a) + w*sin(a))*fr"]
+)toml",
+                                  has_right_foot ? R"x(, { expr = "z - h*cos(a) + w*sin(a)", contact = "r", name = "R" })x" : "",
+                                  has_right_foot ? fmt::format("-{}*abs(lambda(R))*sign(vr)", mu) : "0", mu),
+                      "box");
+}
+
+// Flat on the floor both feet slide at one velocity: two surfaces that are one.
+TEST(ContactFriction, OfTwoFeetBringsABoxToRest) {
+  const Model model = box(0.1, true);
+  for (const double v : {-0.8, -0.7, -0.6, 0.5}) {
+    const Trajectory motion = motion_of(model, {0, 0.2, 0, v, 0, 0}, 5, 6, 1e-10);
+    ASSERT_EQ(motion.states.cols(), 6);
+    EXPECT_NEAR(motion.states(0, 5), v * std::abs(v) / (2 * 0.1 * g), 1e-7) << v;
+  }
+}
+
+TEST(ContactFriction, OfABoxThatFallsOnItsFeetTakesEnergy) {
+  const auto energy = [](const auto& s) { return 2 * g * s[1] + s[3] * s[3] + s[4] * s[4] + 0.025 * s[5] * s[5]; };
+  for (const double mu : {0.1, 0.4}) {
+    const Model model = box(mu, true);
+    for (const double tilt : {-0.3, -0.1, 0.05, 0.3, 0.5}) {
+      for (const double v : {-1.0, 0.0, 0.5}) {
+        const Trajectory motion = motion_of(model, {0, 0.6, tilt, v, 0, 0}, 1, 11);
+        ASSERT_EQ(motion.states.cols(), 11) << mu << ' ' << tilt << ' ' << v;
+        for (Index i = 1; i < 11; ++i) EXPECT_LE(energy(motion.states.col(i)), energy(motion.states.col(i - 1)) + 1e-6);
+      }
+    }
+  }
+}
+
+// the foot that has just come to rest neither opens nor closes by rounding
+TEST(ContactFriction, OfOneFootIsHitOnce) {
+  for (const double mu : {0.1, 0.2, 0.4}) {
+    const Model model = box(mu, false);
+    for (const double tilt : {-0.1, 0.1, 0.2}) {
+      for (const double height : {0.6, 0.7}) {
+        const Trajectory motion = motion_of(model, {0, height, tilt, 0, 0, 0}, 0.4, 5);
+        ASSERT_EQ(motion.states.cols(), 5) << mu << ' ' << tilt << ' ' << height;
+        EXPECT_LT(motion.events.size(), 6U);
+      }
+    }
+  }
+}
+
 // a ball hits a block that its friction holds
 TEST(ContactFriction, LetsABlockGoThatIsHit) {
   const Model model = Model::parse(R"toml(

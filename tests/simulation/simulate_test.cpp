@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <limits>
+#include <numbers>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -136,6 +137,52 @@ TEST(Simulate, ReachesTheSameStateWhateverIsWritten) {
   const Trajectory many = simulate_model(model, figure_start(), with_tolerance(times(6, 301), 1e-6));
   EXPECT_EQ(few.states.col(1), many.states.col(300));
   EXPECT_EQ(few.steps, many.steps);
+}
+
+// Between the stages of a long step nothing acts.
+TEST(Simulate, SeesAForceThatActsForAFewRows) {
+  const Model pulse =
+      Model::parse("coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\nforce = [\"50*exp(-((t - 5)/0.05)^2)\"]\n", "pulse");
+  const Trajectory pushed = simulate_model(pulse, state_of(pulse, {{"x", 0}}), with_tolerance(times(20, 1001), 1e-6));
+  EXPECT_NEAR(pushed.states(1, 1000), 50 * 0.05 * std::sqrt(std::numbers::pi), 1e-3);
+  const Model bump = Model::parse(R"toml(
+coordinates = ["x", "z"]
+[mechanics]
+mass      = [["1", "0"], ["0", "1"]]
+force     = ["0", "-9.81"]
+potential = "9.81*z"
+[constraints]
+position = ["z - 0.05*exp(-((x - 5)/0.1)^2)"]
+)toml",
+                                  "bump");
+  const Trajectory over = simulate_model(bump, solved_state(bump, {{"x", 0}, {"dx", 2}}), with_tolerance(times(5, 501), 1e-6));
+  double slowest = 2;
+  for (Eigen::Index i = 0; i < over.states.cols(); ++i) slowest = std::min(slowest, over.states(2, i));
+  EXPECT_LT(slowest, 1.8) << "up the bump";
+  EXPECT_NEAR(over.states(2, 500), 2, 1e-3) << "and down again";
+}
+
+// One of them says of a velocity that is 0 what two others say of each other.
+TEST(Simulate, RedundantConstraintsMayHoldABodyStill) {
+  for (const char* const coordinates : {R"("x", "z", "y")", R"("x", "y", "z")"}) {
+    const bool is_z_last = std::string(coordinates).ends_with(R"("z")");
+    const Model model = Model::parse(fmt::format(R"toml(
+coordinates = [{}]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+force = [{}]
+[constraints]
+position = ["z - 1", "x - y", "x - y*z"]
+)toml",
+                                                 coordinates, is_z_last ? R"("0", "-y", "-1")" : R"("0", "-1", "-y")"),
+                                     "held");
+    const Trajectory out = simulate_model(model, state_of(model, {{"x", 0.3}, {"y", 0.3}, {"z", 1}, {"dx", 0.5}, {"dy", 0.5}}),
+                                          with_tolerance(times(2, 5), 1e-8));
+    ASSERT_EQ(out.states.cols(), 5);
+    // ẍ = ÿ = −y/2
+    const double w = std::sqrt(0.5);
+    EXPECT_NEAR(out.states(0, 4), 0.3 * std::cos(2 * w) + 0.5 / w * std::sin(2 * w), 1e-6);
+  }
 }
 
 // ---- dry friction

@@ -150,6 +150,25 @@ TEST(HamiltonianTest, MomentsAreThoseOfTheDensityWithinItsBox) {
   }
 }
 
+TEST(HamiltonianTest, AParameterWhosePriorIsOfItsLogarithmHasThatDensity) {
+  // noise so large that the prior alone tells
+  DrawnProblem p = only(make_problem(sloped_line(), 10, {"p"}, 1e4), {Kind::parameter});
+  ASSERT_EQ(p.hyperparameters.size(), 1U);
+  constexpr double median = 0.2, stddev = 0.5;
+  Hyperparameter& h = p.hyperparameters.front();
+  h.value = median, h.lower = 0.005, h.upper = 8;
+  h.hyperprior = {HyperPrior::Form::log_normal, median, stddev};
+  const Objective objective(p.prior, p.observations, p.hyperparameters);
+  HamiltonianOptions options;
+  options.seed = hamiltonian_seed;
+  options.max_evaluations = 10 * draw_evaluations;
+  const HyperparameterDraws draws = draw_about(objective, {p.hyperparameters}, {false}, 25, options);
+  const double mean = median * std::exp(stddev * stddev / 2), spread = mean * std::sqrt(std::expm1(stddev * stddev));
+  EXPECT_GT(draws.effective_size[0], 800);
+  EXPECT_NEAR(draws.mean[0], mean, 4 * spread / std::sqrt(draws.effective_size[0]));
+  EXPECT_NEAR(draws.lower[0], median * std::exp(-1.96 * stddev), 0.015);
+}
+
 TEST(HamiltonianTest, SameSeedSameBitsForAnyNumberOfThreads) {
   const DrawnProblem p = make_problem(sloped_line(), 12, {"p"});
   const Fit one = fit_of(p, drawing(5, 1)), three = fit_of(p, drawing(5, 3));

@@ -1,14 +1,14 @@
 #include "reproduce/experiment.hpp"
 
 #include <algorithm>
-#include <memory>
+#include <cmath>
+#include <limits>
 
 #include <fmt/format.h>
 
 #include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/simulation/generate.hpp"
-#include "model/toml.hpp"
 
 namespace gp2::command {
 
@@ -16,113 +16,88 @@ using Eigen::VectorXd;
 
 std::string word(Protocol::Name protocol) { return protocol == Protocol::Name::paper ? "paper" : "default"; }
 
-// a table of a document that it keeps alive
-struct Section::Node {
-  std::shared_ptr<const toml::table> document;
-  const toml::table* table = nullptr;
-
-  [[nodiscard]] const toml::node* find(const std::string& key) const { return table->get(key); }
+struct Section::Document {
+  std::string name;
+  toml::table root;
 };
 
 Section Section::read(const std::filesystem::path& path) {
   try {
-    auto document = std::make_shared<const toml::table>(toml::parse(read_file(path), path.string()));
-    Section section;
-    section.node_ = std::make_shared<const Node>(Node{document, document.get()});
-    section.where_ = path.string() + ": ";
-    return section;
+    auto document = std::make_shared<Document>(Document{path.string(), toml::parse(read_file(path), path.string())});
+    TomlValue root(document->name, document->root, "");
+    return {std::move(document), std::move(root)};
   } catch (const toml::parse_error& error) {
     throw InputError(fmt::format("{}:{}: {}", path.string(), error.source().begin.line, error.description()));
   }
 }
 
-namespace {
-
-template <typename Value>
-Value value_of(const toml::node* node, const std::string& where, const char* what) {
-  const std::optional<Value> value = node == nullptr ? std::nullopt : node->value<Value>();
-  if (!value) throw InputError(fmt::format("{} must be {}", where, what));
-  return *value;
+TomlValue Section::value(const std::string& key) const {
+  std::optional<TomlValue> value = table_.get(key);
+  if (!value) table_.fail_at(table_.line(), table_.key().empty() ? key : table_.key() + "." + key, "is missing");
+  return *std::move(value);
 }
 
-template <typename Value>
-std::vector<Value> list_of(const toml::node* node, const std::string& where, const char* what) {
-  if (node == nullptr || !node->is_array()) throw InputError(fmt::format("{} must be a list of {}", where, what));
-  std::vector<Value> values;
-  for (const toml::node& item : *node->as_array()) values.push_back(value_of<Value>(&item, where, what));
-  return values;
-}
+bool Section::has(const std::string& key) const { return table_.has(key); }
 
-}  // namespace
-
-bool Section::has(const std::string& key) const { return node_->find(key) != nullptr; }
-
-bool Section::is_list(const std::string& key) const { return has(key) && node_->find(key)->is_array(); }
+bool Section::is_list(const std::string& key) const { return has(key) && value(key).is_array(); }
 
 std::string Section::text(const std::string& key) const {
-  const toml::node* node = node_->find(key);
-  if (node != nullptr && node->is_number()) return shortest(*node->value<double>());
-  return value_of<std::string>(node, where_ + key, "a text");
+  const TomlValue found = value(key);
+  return found.is_number() ? shortest(found.number()) : found.text();
 }
 
 std::string Section::text(const std::string& key, const std::string& otherwise) const { return has(key) ? text(key) : otherwise; }
 
-double Section::number(const std::string& key) const { return value_of<double>(node_->find(key), where_ + key, "a number"); }
+double Section::number(const std::string& key) const { return value(key).number(); }
 
 int Section::integer(const std::string& key) const {
-  return static_cast<int>(value_of<std::int64_t>(node_->find(key), where_ + key, "a whole number"));
+  const TomlValue found = value(key);
+  const double number = found.number();
+  if (number != std::trunc(number) || std::abs(number) > std::numeric_limits<int>::max())
+    found.fail(fmt::format("expected a whole number, got {}", found.written()));
+  return static_cast<int>(number);
 }
 
-bool Section::flag(const std::string& key) const {
-  return has(key) && value_of<bool>(node_->find(key), where_ + key, "true or false");
-}
+bool Section::flag(const std::string& key) const { return has(key) && value(key).boolean(); }
 
 std::string Section::mean() const {
   std::string word = text("mean", "zero");
-  if (word != "zero" && word != "force") throw InputError(fmt::format("{}mean must be zero or force, got '{}'", where_, word));
+  if (word != "zero" && word != "force") value("mean").fail(fmt::format("must be zero or force, got '{}'", word));
   return word;
 }
 
 std::vector<double> Section::numbers(const std::string& key, std::optional<std::size_t> how_many) const {
-  std::vector<double> numbers = list_of<double>(node_->find(key), where_ + key, "numbers");
-  if (how_many && numbers.size() != *how_many) {
-    throw InputError(fmt::format("{}{} must be a list of {} numbers, got {}", where_, key, *how_many, numbers.size()));
-  }
+  std::vector<double> numbers;
+  for (const TomlValue& element : value(key).array()) numbers.push_back(element.number());
+  if (how_many && numbers.size() != *how_many)
+    value(key).fail(fmt::format("must be a list of {} numbers, got {}", *how_many, numbers.size()));
   return numbers;
 }
 
 std::vector<bool> Section::flags(const std::string& key) const {
-  return list_of<bool>(node_->find(key), where_ + key, "true and false");
+  std::vector<bool> flags;
+  for (const TomlValue& element : value(key).array()) flags.push_back(element.boolean());
+  return flags;
 }
 
 std::vector<std::string> Section::texts(const std::string& key) const {
-  return list_of<std::string>(node_->find(key), where_ + key, "texts");
+  std::vector<std::string> texts;
+  for (const TomlValue& element : value(key).array()) texts.push_back(element.text());
+  return texts;
 }
 
-Section Section::section(const std::string& key) const {
-  const toml::node* node = node_->find(key);
-  if (node == nullptr || !node->is_table()) throw InputError(fmt::format("{}{} must be a table", where_, key));
-  Section section;
-  section.node_ = std::make_shared<const Node>(Node{node_->document, node->as_table()});
-  section.where_ = fmt::format("{}{}.", where_, key);
-  return section;
-}
+Section Section::section(const std::string& key) const { return {document_, value(key)}; }
 
 std::vector<Section> Section::sections(const std::string& key) const {
-  const toml::node* node = node_->find(key);
-  if (node == nullptr || !node->is_array_of_tables()) throw InputError(fmt::format("{}[[{}]] is missing", where_, key));
   std::vector<Section> sections;
-  for (const toml::node& item : *node->as_array()) {
-    Section& section = sections.emplace_back();
-    section.node_ = std::make_shared<const Node>(Node{node_->document, item.as_table()});
-    section.where_ = fmt::format("{}{}[{}].", where_, key, sections.size());
-  }
+  for (TomlValue& table : value(key).array()) sections.push_back({document_, std::move(table)});
   return sections;
 }
 
 std::vector<std::string> Section::keys() const {
   std::vector<std::string> keys;
-  for (const auto& [key, value] : *node_->table) keys.emplace_back(key.str());
+  for (const auto& [name, value] : table_.entries()) keys.push_back(name);
+  std::ranges::sort(keys);
   return keys;
 }
 

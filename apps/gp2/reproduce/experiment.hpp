@@ -15,6 +15,7 @@
 #include "gp2/fit.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/model.hpp"
+#include "model/toml_value.hpp"
 
 namespace gp2::command {
 
@@ -30,7 +31,7 @@ struct ReproduceOptions {
 
 std::string word(Protocol::Name protocol);  // "paper", "default"
 
-/// A definition in experiments/*.toml, read with errors that name file and key. `Section` is one of its tables.
+/// A definition in experiments/*.toml, or one of its tables, read with errors that name file, line and key.
 class Section {
  public:
   static Section read(const std::filesystem::path& path);
@@ -48,12 +49,15 @@ class Section {
   [[nodiscard]] std::vector<std::string> texts(const std::string& key) const;
   [[nodiscard]] Section section(const std::string& key) const;
   [[nodiscard]] std::vector<Section> sections(const std::string& key) const;  // [[key]]
-  [[nodiscard]] std::vector<std::string> keys() const;
+  [[nodiscard]] std::vector<std::string> keys() const;                        // by name
 
  private:
-  struct Node;
-  std::shared_ptr<const Node> node_;
-  std::string where_;  // for messages: file and key
+  struct Document;
+  Section(std::shared_ptr<const Document> document, TomlValue table) : document_(std::move(document)), table_(std::move(table)) {}
+  [[nodiscard]] TomlValue value(const std::string& key) const;  // that must be there
+
+  std::shared_ptr<const Document> document_;  // that the table stands in
+  TomlValue table_;
 };
 
 /// A way to predict accelerations, as a [[method]] defines it.

@@ -51,7 +51,9 @@ class LogReader {
   [[nodiscard]] int column(const std::string& name) { return has(name) ? require(name) : -1; }
   /// Where the log says what belongs together; −1 where it does not.
   [[nodiscard]] int episode_column();
-  [[nodiscard]] const std::map<std::string, std::string>& aliases_used() const { return aliases_used_; }  // model's -> log's name
+  /// After the reading is done: what was read under another name, and a warning of each name of `columns` that the table lacks
+  /// though it has others of them.
+  [[nodiscard]] std::vector<std::string> notes() const;
   [[nodiscard]] std::vector<std::string> unused_columns() const;  // after the reading is done
 
  private:
@@ -63,9 +65,9 @@ class LogReader {
 
   const CsvTable& table_;
   const System& system_;
-  std::map<std::string, std::string> columns_;
+  std::map<std::string, std::string> given_;    // names of columns as given
+  std::map<std::string, std::string> columns_;  // and what these imply for velocities and accelerations
   std::map<std::string, std::vector<std::string>> aliases_;
-  std::map<std::string, std::string> aliases_used_;
   std::map<int, std::string> used_;  // column -> what it was read as
 };
 

@@ -57,7 +57,8 @@ struct Evaluation : Calibration {
 std::vector<int> observed_rows(const Posterior& posterior);
 
 /// Noise of measured accelerations as training knows it (rows × N): the stated deviations, times the factor that training found for
-/// those stated there; where none is stated the usual noise of the row in the first observations that have it, NaN where none have.
+/// those stated there; where none is stated the usual noise of the row, NaN where no observations have it. Of several observations
+/// the root mean square over their values.
 ///
 /// @param stated  (rows × N); NaN: not stated; empty: none is
 Eigen::MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Eigen::Index n_states,

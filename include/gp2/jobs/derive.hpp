@@ -54,6 +54,7 @@ struct DerivedSeries {
   double rate = 0;              // usual, of its samples [Hz]
   double bandwidth = 0;         // up to which the motion stands out of the noise [Hz]
   int used = 0;                 // measurements
+  bool has_velocities = false;  // among them
   int missing = 0;              // empty cells and NaN
   int repeated = 0;             // the same value at the same time
   int outliers = 0;             // distrusted

@@ -35,6 +35,9 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
 /// @param fit  whose report loses the draws of the hyperparameters under which there is no posterior of all; and learns the log's name
 Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
+/// remove_oldest() of a posterior and its fit, whose report keeps the distrusted values among what is left.
+Posterior remove_oldest(Posterior&& posterior, FitFile& fit, int n);
+
 /// Leaves the newest states that a window asks for, and the names of the logs that they are of, by the rows of these.
 /// @throws InputError as remove_oldest, and for a window that is not positive.
 void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request);
