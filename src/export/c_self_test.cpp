@@ -88,7 +88,9 @@ std::pair<double, double> Writer::rounding_at(const VectorXd& state, double prio
 }
 
 void Writer::write_tests() {
-  const MatrixXd& observed = components_.front()->observations.front().states();
+  const std::vector<Observations>& observations = components_.front()->observations;
+  const auto any = std::ranges::find_if(observations, [](const Observations& group) { return group.n_data() > 0; });
+  const MatrixXd& observed = (any == observations.end() ? observations.front() : *any).states();
   const Predictor predictor(posterior_, view_, {options_.stddev, options_.jacobian, Predictor::Storage::double_precision});
   const Predictor before(posterior_.without_data(), view_, {true, false, Predictor::Storage::double_precision});
   Predictor::Workspace workspace = predictor.make_workspace(), workspace_before = before.make_workspace();

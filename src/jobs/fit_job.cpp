@@ -698,9 +698,11 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   FitProblem problem;
   problem.prior_options = fit.prior_options;
   problem.prior = fit.prior();
-  problem.observations = fit.observations;
-  problem.systems = fit.systems;
-  problem.systems.resize(problem.observations.size());
+  for (std::size_t g = 0; g < fit.observations.size(); ++g) {
+    if (fit.observations[g].n_data() == 0) continue;  // all of which a window has left behind
+    problem.observations.push_back(fit.observations[g]);
+    problem.systems.push_back(g < fit.systems.size() ? fit.systems[g] : nullptr);
+  }
   problem.lines.resize(problem.observations.size());
   problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
   FitJob job = job_of(std::move(request), std::move(problem));

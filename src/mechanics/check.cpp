@@ -242,13 +242,36 @@ void report_conditions(const System& system, const MatrixXd& sizes, std::vector<
   }
 }
 
+// The norm of a row of A beside a state; 0 where it is rounding of other rows.
+double size_beside(const System& system, VectorXd state, const VectorXd& parameters, int row) {
+  for (int j = 0; j < system.nq(); ++j) {
+    double& q = state[system.layout().q(j)];
+    q += 1e-3 * (1 + 0.1 * j) * (1 + std::abs(q));
+  }
+  constexpr double rounding = 1e-12;
+  const VectorXd sizes = system.evaluate(state, parameters).A(0).rowwise().norm();
+  return sizes[row] > rounding * std::max(1.0, sizes.maxCoeff()) ? sizes[row] : 0;
+}
+
 // a row of A that nearly vanishes somewhere decides the direction of its force from rounding
 /// @param sizes  norms of the rows of A (nc × N)
-void report_row_sizes(const System& system, const MatrixXd& sizes, int n_zero_rows, std::vector<Finding>& findings) {
+/// @param state  one of them
+void report_row_sizes(const System& system, const VectorXd& state, const VectorXd& parameters, const MatrixXd& sizes,
+                      int n_zero_rows, std::vector<Finding>& findings) {
   for (int row = 0; row < system.nc(); ++row) {
     const std::string& label = system.constraint_labels()[static_cast<std::size_t>(row)];
     if (system.is_conditional(row)) {
       n_zero_rows -= static_cast<int>((sizes.row(row).array() == 0).count());
+      continue;
+    }
+    // that of (q1 − q2)², unlike that of a loop in a plane which is closed in space
+    constexpr double vanishing = 1e-9;
+    if (const double beside = size_beside(system, state, parameters, row); sizes.row(row).maxCoeff() < vanishing * beside) {
+      n_zero_rows -= static_cast<int>((sizes.row(row).array() == 0).count());
+      findings.push_back(
+          {Level::warning, fmt::format("constraint '{}': its row of A is zero wherever it holds, as that of a square "
+                                       "is, so that it holds nothing; write its root",
+                                       label)});
       continue;
     }
     if (sizes.row(row).isZero(0)) {
@@ -305,7 +328,7 @@ bool check_mechanics(const System& system, const Ref<const MatrixXd>& states, co
   }
   report_rank(system, ranks, mechanics, findings);
   report_conditions(system, sizes, findings);
-  report_row_sizes(system, sizes, mechanics.n_zero_rows, findings);
+  report_row_sizes(system, states.col(0), parameters, sizes, mechanics.n_zero_rows, findings);
   return true;
 }
 

@@ -126,6 +126,7 @@ TEST(UpdateJob, AWindowLeavesTheNewestOfSeveralLogsToo) {
   }
   ASSERT_EQ(left.cols(), 15);
   EXPECT_EQ(left, wanted);
+  EXPECT_EQ(run_fit(prepare_fit_again(fit, 1)).posterior.n_states(), 15);
 }
 
 TEST(UpdateJob, AWindowKeepsWhatIsDistrustedAmongTheNewest) {

@@ -60,6 +60,7 @@ TEST(Check, ConstraintsThatLeaveNoFreedomAreWarnedOf) {
   EXPECT_EQ(said(""), "");
   EXPECT_THAT(said("[constraints]\nacceleration = ['ddx - 1', 'ddz - x*ddx']"), HasSubstr("they leave no freedom"));
   EXPECT_EQ(said("[constraints]\nacceleration = ['ddz - x*ddx']"), "");
+  EXPECT_THAT(said("[constraints]\nposition = ['(z - 0.5*x^2)^2']"), HasSubstr("its row of A is zero wherever it holds"));
 }
 
 TEST(Check, AMotionThatConstraintsSayAllOfHasNoColumnsToObserve) {
