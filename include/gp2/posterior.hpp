@@ -175,9 +175,9 @@ class Posterior {
 ///     posterior = update(std::move(posterior), {x, ddq, y, sigma});
 ///
 /// The noise of new observations is their own, or where they join a group that of each component; of earlier ones values().noise_stddev.
-/// Where both view and noise_stddev(g) are those of an earlier group of observations() the new ones join it behind its last, if both
-/// have a noise of each value or neither has; else they are a new group, with its noise in values(). So Posterior(prior(),
-/// observations(), values()) is always the posterior built anew.
+/// Where both view and noise_stddev(g) are those of the last group of observations() (through inducing points, of any) the new ones
+/// join it behind its last, if both have a noise of each value or neither has; else they are a new group, with its noise in values().
+/// So Posterior(prior(), observations(), values()) is always the posterior built anew, in which what comes first is the oldest.
 ///
 /// In place where no copy of `posterior` is held, by PathwiseSamples either; else a copy is changed and the others
 /// stay what they are. Memory is drawn for the factor only when what was set aside is full, and then for half as many rows again.

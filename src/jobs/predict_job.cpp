@@ -386,7 +386,7 @@ void note_differing_noise(const Posterior& posterior, const std::vector<int>& ro
     for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
       const Observations& group = posterior.observations()[g];
       const auto at = std::ranges::find(group.view().rows, row);
-      if (!group.view().is_of_ddq() || at == group.view().rows.end()) continue;
+      if (!group.view().is_of_ddq() || group.n_data() == 0 || at == group.view().rows.end()) continue;
       const double noise = group.usual_noise(posterior.noise_stddev(g))[at - group.view().rows.begin()];
       least = std::min(least, noise), most = std::max(most, noise);
     }
