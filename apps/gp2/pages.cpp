@@ -15,8 +15,8 @@ namespace gp2::command {
 namespace {
 
 constexpr std::string_view exit_codes =
-    "0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit and gp2 excite save "
-    "the best result so far). Results go to stdout, messages to stderr.";
+    "0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit, excite and simulate "
+    "save what there is so far). Results go to stdout, messages to stderr.";
 constexpr std::string_view example =
     "gp2 generate models/surface.toml --n 100 -o train.csv\n"
     "gp2 fit models/surface.toml --data train.csv -o fit.json\n"

@@ -134,6 +134,7 @@ struct InducingReport {
   int n_variables = 0;                             // M
   Eigen::VectorXd left_out;                        // t of all observations, per latent: left_out_by_points
   int n_start = 0;                                 // states that the hyperparameters were fitted to before all of them
+  int n_starts = 1;                                // optimiser runs of that: through points there is one
   std::optional<Evaluation::Part> stretches;       // CrossValidation::stretches of all observations, which no file can tell again
 };
 

@@ -163,7 +163,8 @@ class Posterior {
   [[nodiscard]] const Components& conditioned() const;         // those, conditioned
   [[nodiscard]] const Implementation& implementation() const;  // the first component; throws likewise
   // those of this one where nobody else holds them, else copies
-  [[nodiscard]] std::vector<std::shared_ptr<Implementation>> own_components() const;
+  // @param conditions_anew  whether their latents are going to be conditioned anew: then they are copies without these
+  [[nodiscard]] std::vector<std::shared_ptr<Implementation>> own_components(bool conditions_anew = false) const;
 
   Components components_;
 };
@@ -196,7 +197,8 @@ void set_prior(Posterior& posterior, const Prior& prior);
 [[nodiscard]] Posterior forget(Posterior&& posterior, double share);
 
 /// The posterior without the n observed states that were added first; those given to the constructor count in their order, group
-/// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group that
+/// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew, which it is
+/// where more than half of them go. A group that
 /// update() added goes with its last state; one that was given to the constructor stays, without states, and keeps its noise,
 /// since hyperparameters call it by its number. In place and otherwise as update.
 /// @throws InputError when there are fewer, or what was learned went through inducing points; `posterior` is left as it was.

@@ -734,7 +734,7 @@ def resample(
     # end of options
 ) -> Table: ...
 def show(
-    system: System | Posterior,
+    system: System | Posterior | _Path,
     *,
     # options of show: written by scripts/options
     latex: bool = False,

@@ -131,8 +131,8 @@ def _with_hash(described: Any) -> Any:
 
 
 def _prepare() -> None:
-    # what never changes is its own copy
-    for fixed in (_gp2.System, _gp2.Table, _gp2.Log, _gp2.SideInformation):
+    # what never changes is its own copy; what a Log or a SideInformation holds may change
+    for fixed in (_gp2.System, _gp2.Table):
         setattr(fixed, "__copy__", lambda self: self)
         setattr(fixed, "__deepcopy__", lambda self, memo: self)
     setattr(_gp2.System, "__eq__", _are_equal)

@@ -44,14 +44,16 @@ def _plot_predictions(self: _gp2.Posterior, data: Any, system: Any = None, colum
     """plot_predictions(self: Posterior, data: Table, system: System | None = None, columns: Mapping | None = None, *, ax=None)
 
     Draw predicted accelerations, with their 95 % intervals, against those that a log has measured; returns an array of axes, one for
-    each output. Exact predictions lie on the line.
+    each output. The intervals include the measurement noise where it is known, so that 95 % of them should reach the line, on which
+    exact predictions of exact measurements lie.
     """
     found = _gp2._compared(self, data, system, columns)  # type: ignore[attr-defined]
     axes = np.ravel(_axes(ax, len(found["outputs"]), 4))
     if axes.size != len(found["outputs"]):
         raise _gp2.InputError(f"ax: expected {len(found['outputs'])} axes, of {', '.join(found['outputs'])}; got {axes.size}")
     for k, output in enumerate(map(_text, found["outputs"])):
-        measured, mean, half = found["measured"][:, k], found["mean"][:, k], _BAND * found["std"][:, k]
+        measured, mean = found["measured"][:, k], found["mean"][:, k]
+        half = _BAND * np.hypot(found["std"][:, k], np.nan_to_num(found["noise"][:, k]))
         axes[k].errorbar(measured, mean, half, fmt=".", elinewidth=0.8, ecolor="lightgray")
         axes[k].axline((float(np.nanmean(measured)),) * 2, slope=1, color="gray", lw=0.8)
         axes[k].set(xlabel=f"measured {output}", ylabel=f"predicted {output}")

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import numbers
 import os
 import re
 import warnings
@@ -31,7 +32,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     X holds states. An array has the columns of `system.state_names`: q, dq, t, u. A frame has columns by these names, in any
     order; one that the system does not read may be missing. `fit` and `predict` each take either, whatever the other was given;
-    a frame whose columns have no names is an array. y holds measured accelerations: an array with the columns of
+    a frame whose columns are whole numbers is an array. y holds measured accelerations: an array with the columns of
     `system.acceleration_names` or of `observe`, (n,) where it is one, or a frame by name, whose columns are what is observed.
     Predictions have the shape and the columns of y. Without a system the columns of X are those of `fit`, as in scikit-learn.
 
@@ -104,10 +105,12 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.__dict__.pop("posterior_", None)  # of an earlier fit, should this one fail
         system = self._given_system()
         self._has_mechanics = system is not None
+        if system is None and self.observe is not None:
+            raise gp2.InputError("observe: goes with a system")
         if system is not None:
             _warn_of_late_inputs(system)
             outputs = self._outputs(system, y)
-            y = _columns_by_name(y, outputs)
+            y = _columns_by_name(y, outputs, system)
         given = None if system is None else _column_names("X", X)  # before it becomes an array
         X, y = validate_data(self, _without_mask(X), _without_mask(y), dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         rows = y.reshape(len(y), -1).astype(np.float64)
@@ -138,7 +141,8 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         }
         others = dict(self.fit_options or {})
         for name in sorted(others.keys() & (options.keys() | self.get_params().keys() | {"data"})):
-            raise gp2.InputError(f"fit_options: '{name}' is an argument of GP2Regressor itself")
+            own = {"restarts": "n_restarts", "threads": "n_threads", "seed": "random_state"}.get(name, name)
+            raise gp2.InputError(f"fit_options: '{name}' is the argument {own} of GP2Regressor itself")
         try:
             self.posterior_ = gp2.fit(self.system_, (states, accelerations), **options, **others)
         except (gp2.InputError, TypeError) as error:
@@ -175,7 +179,8 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def score(self, X, y, sample_weight=None) -> float:
         """R² of the prediction, the mean over the columns of y."""
         check_is_fitted(self, "posterior_")
-        return super().score(X, _columns_by_name(y, self.outputs_) if self._has_mechanics else y, sample_weight)
+        y = _columns_by_name(y, self.outputs_, self.system_) if self._has_mechanics else y
+        return super().score(X, _without_mask(y), sample_weight)
 
     def _given_system(self) -> gp2.System | None:
         if self.system is None or isinstance(self.system, gp2.System):
@@ -186,13 +191,10 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _outputs(self, system: gp2.System, y) -> list[str]:
         names = system.acceleration_names
-        of_series = [y.name] if getattr(y, "name", None) in names else None
         if self.observe is not None:
             what, outputs = "observe", [self.observe] if isinstance(self.observe, str) else list(self.observe)
-            if of_series and outputs != of_series:
-                raise gp2.InputError(f"y: no column {', '.join(map(str, outputs))}; it is {y.name}")
         else:
-            what, outputs = "y", _column_names("y", y) or of_series or names
+            what, outputs = "y", _column_names("y", y) or _name_of_series(y, system) or names
         if not outputs:
             raise gp2.InputError(f"{what}: expected at least one name, got []")
         _refuse_twice(what, [str(name) for name in outputs])
@@ -276,13 +278,20 @@ def _without_mask(values):
 
 
 def _column_names(what: str, table) -> list[str] | None:
-    """The names of a frame's columns; None where they are but numbers, or it is no frame."""
+    """The names of a frame's columns; None where they are whole numbers, or it is no frame."""
     names = list(getattr(table, "columns", []))
-    if not any(isinstance(name, str) for name in names):
+    if hasattr(table, "column_names") or all(isinstance(name, numbers.Integral) for name in names):  # Arrow's columns are values
         return None
-    names = [str(name) for name in names]
+    for name in names:
+        if not isinstance(name, str):
+            raise gp2.InputError(f"{what}: column names must be text, got {name!r}")
     _refuse_twice(what, names)
     return names
+
+
+def _name_of_series(y, system: gp2.System) -> list[str] | None:
+    """The name of a Series that is an acceleration of the system, in a list; None of all else."""
+    return [y.name] if getattr(y, "name", None) in system.acceleration_names else None
 
 
 def _warn_of_late_inputs(system: gp2.System) -> None:
@@ -298,14 +307,15 @@ def _refuse_twice(what: str, names: list[str]) -> None:
         raise gp2.InputError(f"{what}: {', '.join(twice)}: given twice")
 
 
-def _columns_by_name(y, names: list[str]):
-    given = _column_names("y", y)
+def _columns_by_name(y, names: list[str], system: gp2.System):
+    columns = _column_names("y", y)
+    given = columns or _name_of_series(y, system)
     if given is None:
         return y
     missing = [name for name in names if name not in given]
     if missing:
         raise gp2.InputError(f"y: no column {', '.join(missing)}; it has: {', '.join(given)}")
-    return y[names]
+    return y[names] if columns else y
 
 
 def _seed(random_state) -> int:

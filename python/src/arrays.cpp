@@ -114,7 +114,7 @@ py::array_t<double, py::array::c_style> vector_argument(const py::object& array,
                                                         const std::string& what) {
   const std::optional<py::list> given = column_names(array);
   if (!given) return vector_argument(array, std::ssize(names), what);
-  require_once(*given, what);
+  require_names(*given, what);
   Eigen::VectorXd values = Eigen::VectorXd::Constant(std::ssize(names), not_a_number);
   for (const py::handle key : *given) {
     const std::string name = py::str(key);
@@ -149,13 +149,17 @@ std::optional<py::list> column_names(const py::object& data) {
   } else {
     return std::nullopt;
   }
-  const bool are_names = std::any_of(names.begin(), names.end(), [](py::handle name) { return py::isinstance<py::str>(name); });
-  return are_names || names.empty() ? std::optional(std::move(names)) : std::nullopt;
+  const bool are_numbers =
+      std::all_of(names.begin(), names.end(), [](py::handle name) { return PyIndex_Check(name.ptr()) != 0; });
+  return are_numbers && !names.empty() ? std::nullopt : std::optional(std::move(names));
 }
 
-void require_once(const py::list& names, const std::string& what) {
+void require_names(const py::list& names, const std::string& what) {
   std::set<std::string> seen;
   for (const py::handle one : names) {
+    if (!py::isinstance<py::str>(one)) {
+      throw InputError(fmt::format("{}: column names must be text, got {}", what, std::string(py::repr(one))));
+    }
     const std::string name = py::str(one);
     if (!seen.insert(name).second) throw InputError(fmt::format("{}: the column '{}' stands twice", what, name));
   }

@@ -20,7 +20,7 @@ class Rows {
  public:
   /// @param what  stands for the argument in messages
   /// @throws py::type_error when the array does not hold real numbers; InputError when it is not (n, names.size()), or when a table
-  ///   has a column of another name, or one twice.
+  ///   has a column of another name, one twice, or one whose name is no text.
   Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (d × n)
@@ -47,11 +47,11 @@ py::array_t<double, py::array::c_style> vector_argument(const py::object& array,
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::string& what);
 
 /// The names of the columns of a mapping, a frame, a table of Arrow or a structured array, keys as they are; nothing of what is no table, or has only
-/// numbers for names.
+/// whole numbers for names.
 std::optional<py::list> column_names(const py::object& data);
 
-/// @throws InputError for a name that stands twice.
-void require_once(const py::list& names, const std::string& what);
+/// @throws InputError for a name that is no text, or that stands twice.
+void require_names(const py::list& names, const std::string& what);
 
 /// Whether an argument is an array rather than a table: a list or tuple, or what has a shape, but no named columns.
 bool is_array(const py::object& data);

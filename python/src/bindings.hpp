@@ -76,8 +76,8 @@ auto unlocked(const Work& work) {
   return work();
 }
 
-/// A str, bytes or os.PathLike. @throws py::type_error naming the argument
-std::string path_argument(const py::object& path, const std::string& name = "path");
+/// A str, bytes or os.PathLike. @throws py::type_error naming the argument, and what is expected of it
+std::string path_argument(const py::object& path, const std::string& name = "path", const char* expected = "a path");
 
 /// What became of each column of a raw log.
 pybind11::dict report_of(const DerivedData& derived, const System& system);

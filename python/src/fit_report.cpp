@@ -125,7 +125,8 @@ std::string text_of(const FitReport& self) {
 void define_report(py::class_<FitReport>& report) {
   report.def_readonly("hyperparameters", &FitReport::hyperparameters, "Fitted values, list of Hyperparameter.")
       .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
-                    "-log p(y), physical units, all constants, without hyper-prior.")
+                    "-log p(y) at the fit, physical units, all constants, without hyper-prior. After an update "
+                    "Posterior.negative_log_likelihood is that of the rows there are now.")
       .def_readonly("objective", &FitReport::objective, "With hyper-priors: what was minimised.")
       .def_readonly("converged", &FitReport::converged, "Whether the optimiser met its tolerances.")
       .def_readonly("termination", &FitReport::termination, "Which inequality stopped the optimiser.")

@@ -4,8 +4,10 @@
 #include <array>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
@@ -34,6 +36,16 @@ std::string called(const std::string& text, const std::string& signatures) {
   return of_class.is_none() ? text.substr(0, text.find('(')) : of_class.attr("group")(1).cast<std::string>();
 }
 
+// The parameters of one signature as they stand in it: "view: str = 'constrained'", "*", "**kwargs". Of several there are none.
+std::vector<std::string> parameters_in(const std::string& signatures) {
+  const std::size_t first = signatures.find('(') + 1, end = std::min(signatures.rfind(") ->"), signatures.rfind(')'));
+  if (signatures.find(" 2. ") != std::string::npos || first == 0 || end == std::string::npos || end <= first) return {};
+  const py::object split = py::module_::import("re").attr("split")(R"(, (?=\w+: |\*))", signatures.substr(first, end - first));
+  return split.cast<std::vector<std::string>>();
+}
+
+std::string name_in(const std::string& parameter) { return parameter.substr(0, parameter.find(':')); }
+
 // A keyword that no signature has. One that ends in **kwargs has others too: there a keyword that is near a parameter is taken for it.
 void refuse_unknown_keyword(const std::string& text, const std::string& signatures, const py::dict& keywords) {
   const bool has_others = signatures.find("**") != std::string::npos;
@@ -51,6 +63,43 @@ void refuse_unknown_keyword(const std::string& text, const std::string& signatur
   }
 }
 
+// More arguments by position than there may be, or one by position and by name too.
+void refuse_by_position(const std::string& text, const std::string& signatures, const py::tuple& arguments,
+                        const py::dict& keywords) {
+  if (signatures.find(" 2. ") != std::string::npos) return;
+  const std::string function = called(text, signatures);
+  bool has_object = text.starts_with("__init__()");  // among the arguments; in the signature of a method it is `self`
+  std::vector<std::string> by_position, by_name;
+  bool are_by_name = false;
+  for (const std::string& parameter : parameters_in(signatures)) {
+    const std::string name = name_in(parameter);
+    if (name == "self") {
+      has_object = true;
+    } else if (parameter == "*") {
+      are_by_name = true;
+    } else if (parameter.starts_with("**")) {
+      by_name.emplace_back("help() lists them");
+    } else if (are_by_name) {
+      by_name.push_back(name + "=…");
+    } else {
+      by_position.push_back(name);
+    }
+  }
+  const std::size_t n_given = arguments.size() - std::min<std::size_t>(arguments.size(), has_object ? 1 : 0);
+  for (std::size_t k = 0; k < std::min(n_given, by_position.size()); ++k) {
+    if (!keywords.contains(by_position[k])) continue;
+    throw py::type_error(fmt::format("{}() got the argument '{}' twice: by position and by name", function, by_position[k]));
+  }
+  if (n_given <= by_position.size()) return;
+  if (function == "System") throw py::type_error("System() takes keywords; gp2.System.load reads a model file");
+  if (!by_name.empty()) {
+    throw py::type_error(fmt::format("{}() takes {} by position; write what follows with its name: {}", function,
+                                     fmt::join(by_position, ", "), fmt::join(by_name, ", ")));
+  }
+  const std::string most = by_position.empty() ? "arguments" : fmt::format("more than {}", fmt::join(by_position, ", "));
+  throw py::type_error(fmt::format("{}() takes no {}", function, most));
+}
+
 /// What a parameter of a type takes, and whether a value is one; nothing of types whose values tell of themselves.
 struct Takes {
   const char* type;
@@ -58,6 +107,11 @@ struct Takes {
   bool (*fits)(py::handle value);
 };
 bool is_index(py::handle value) { return PyIndex_Check(value.ptr()) != 0; }
+bool is_number(py::handle value) {
+  if (PyFloat_AsDouble(value.ptr()) != -1 || PyErr_Occurred() == nullptr) return true;
+  PyErr_Clear();
+  return false;
+}
 bool is_text(py::handle value) { return py::isinstance<py::str>(value); }
 bool is_list_of_text(py::handle value) {
   if (is_text(value) || !py::isinstance<py::sequence>(value)) return false;
@@ -66,7 +120,7 @@ bool is_list_of_text(py::handle value) {
 }
 constexpr std::array takes = {
     Takes{"int", "a whole number", &is_index},
-    Takes{"float", "a number", [](py::handle value) { return PyNumber_Check(value.ptr()) != 0; }},
+    Takes{"float", "a number", &is_number},
     Takes{"bool", "True or False", [](py::handle value) { return py::isinstance<py::bool_>(value) || is_index(value); }},
     Takes{"str", "a str", &is_text},
     Takes{"List[str]", "a list of names", &is_list_of_text},
@@ -82,7 +136,9 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
   if (signatures.find(" 2. ") != std::string::npos) return;
   const py::object re = py::module_::import("re");
   std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
-  std::string negative;  // a whole number below 0, which is what is wrong where nothing else is
+  // a whole number below 0, or one that is too large: what is wrong where nothing else is
+  std::string negative;
+  std::vector<std::pair<std::string, py::object>> whole_numbers;
   for (const py::handle parameter : re.attr("findall")(R"((\w+): (Optional\[)?([\w.]+(?:\[\w+\])?))", signatures)) {
     const auto parts = parameter.cast<std::array<std::string, 3>>();
     const std::string &name = parts[0], &optional = parts[1], &type = parts[2];
@@ -105,22 +161,21 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
     const auto number = py::reinterpret_steal<py::object>(PyNumber_Index(value.ptr()));
     if (!number) throw py::type_error((PyErr_Clear(), got(known->words)));  // an array may only seem to be one
     if (number < py::int_(0)) negative = got("a whole number that is not negative");
+    whole_numbers.emplace_back(name, value);
   }
   if (!negative.empty()) throw py::type_error(negative);
+  for (const int bits : {64, 31}) {
+    for (const auto& [name, number] : whole_numbers) gp2::python::require_bits(bits, number, name);
+  }
 }
 
 // An argument without a default that is not given, where there is one signature.
 void refuse_missing_argument(const std::string& text, const std::string& signatures, const py::tuple& arguments,
                              const py::dict& keywords) {
-  if (signatures.find(" 2. ") != std::string::npos) return;
-  const std::size_t first = signatures.find('(') + 1, end = std::min(signatures.rfind(") ->"), signatures.rfind(')'));
-  if (first == 0 || end == std::string::npos || end <= first) return;
   std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
-  const py::object split = py::module_::import("re").attr("split")(R"(, (?=\w+: |\*))", signatures.substr(first, end - first));
-  for (const py::handle part : split) {
-    const auto parameter = part.cast<std::string>();
+  for (const std::string& parameter : parameters_in(signatures)) {
     if (parameter.starts_with('*')) return;
-    const std::string name = parameter.substr(0, parameter.find(':'));
+    const std::string name = name_in(parameter);
     const bool is_optional = parameter.find(" = ") != std::string::npos;
     if (position++ < arguments.size() || is_optional || keywords.contains(name)) continue;
     throw py::type_error(fmt::format("{}() is missing the argument '{}'", called(text, signatures), name));
@@ -140,6 +195,7 @@ PyObject* dispatch_or_say_why(PyObject* self, PyObject* arguments, PyObject* key
     }
     if (!signatures.empty()) {
       refuse_unknown_keyword(text, signatures, given);
+      refuse_by_position(text, signatures, positional, given);
       refuse_wrong_type(text, signatures, positional, given);
       refuse_missing_argument(text, signatures, positional, given);
     }

@@ -109,7 +109,11 @@ void read_keyword(py::handle given, const Option& option) {
             if (is_list_with_default(option)) *list = names_or_all(*list, name.c_str());
           },
           [&](std::optional<std::vector<std::string>>* list) {
-            *list = argument<std::vector<std::string>>(given, name, "a list of names");
+            const char* const expected = "a list of names, [] for none";
+            *list = argument<std::vector<std::string>>(given, name, expected);
+            if (**list == std::vector<std::string>{"none"}) {  // the word of the command
+              throw InputError(fmt::format("{}: expected {}, got {}", name, expected, "['none']"));
+            }
           },
           [&](std::map<std::string, std::string>* columns) {
             *columns = columns_argument(py::reinterpret_borrow<py::object>(given));
@@ -224,7 +228,7 @@ std::string value_text(const Option& option, const std::string& value) {
   return std::visit(Overloaded{[&](const Choice& one) { return is_word(one.words) ? "'" + value + "'" : value; },
                                [&](const NumberOrWord& one) { return is_word(words_of(one)) ? "'" + value + "'" : value; },
                                [&](std::vector<std::string>*) { return list(); },
-                               [&](std::optional<std::vector<std::string>>*) { return list(); },
+                               [&](std::optional<std::vector<std::string>>*) { return value == "none" ? "[]" : list(); },
                                [&](std::map<std::string, std::string>*) {
                                  const std::size_t equals = value.rfind('=');
                                  return fmt::format("{{'{}': '{}'}}", value.substr(equals + 1), value.substr(0, equals));
@@ -238,6 +242,14 @@ std::string value_text(const Option& option, const std::string& value) {
 bool is_truth_value(py::handle given) {
   const std::string_view type = Py_TYPE(given.ptr())->tp_name;
   return type == "bool" || type == "numpy.bool" || type == "numpy.bool_";
+}
+
+void require_bits(int bits, py::handle given, const std::string& name) {
+  if (PyIndex_Check(given.ptr()) == 0) return;
+  const auto number = py::reinterpret_steal<py::object>(PyNumber_Index(given.ptr()));
+  if (!number) return PyErr_Clear();  // an array may only seem to be one
+  if (number < (py::int_(1) << py::int_(bits))) return;
+  throw py::type_error(fmt::format("{}: expected a whole number below 2^{}, got {}", name, bits, std::string(py::repr(given))));
 }
 
 const std::string& keyword_of(const Option& option) { return option.keyword.empty() ? option.name : option.keyword; }

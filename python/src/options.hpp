@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <string>
 #include <type_traits>
 #include <vector>
@@ -16,6 +17,9 @@ namespace py = pybind11;
 /// Whether it is Python's truth value, or NumPy's.
 bool is_truth_value(py::handle given);
 
+/// @throws py::type_error for a whole number from 2^bits on.
+void require_bits(int bits, py::handle given, const std::string& name);
+
 /// A value as a T. Python's own conversions take True for the number 1, and any number for true; as an argument each is a slip.
 /// @throws py::type_error saying what is expected.
 template <typename T>
@@ -24,6 +28,7 @@ T argument(py::handle given, const std::string& name, const std::string& expecte
     if (std::is_arithmetic_v<T> && std::is_same_v<T, bool> != is_truth_value(given)) throw py::cast_error();
     return given.cast<T>();
   } catch (const py::cast_error&) {
+    if constexpr (std::is_integral_v<T> && !std::is_same_v<T, bool>) require_bits(std::numeric_limits<T>::digits, given, name);
     throw py::type_error(fmt::format("{}: expected {}, got {}", name, expected, std::string(py::repr(given))));
   }
 }

@@ -41,8 +41,8 @@ static auto fields(Evaluation& of) {
 }
 static auto fields(LeftOutScores& of) { return std::tie(of.view, of.one_by_one, of.stretches, of.values, of.nrmse_of_noise); }
 static auto fields(TrainingResidual& of) {
-  return std::tie(of.group, of.output, of.n, of.rms, of.coverage95, of.serial_correlation, of.rms_in_noise, of.n_far, of.farthest,
-                  of.farthest_state, of.is_of_ddq);
+  return std::tie(of.group, of.output, of.n, of.rms, of.coverage95, of.serial_correlation, of.n_serial, of.rms_in_noise, of.n_far,
+                  of.farthest, of.farthest_state, of.is_of_ddq);
 }
 static auto fields(CrossValidation& of) {
   return std::tuple_cat(fields(static_cast<LeftOutScores&>(of)), std::tie(of.other_views, of.residuals));
@@ -322,10 +322,11 @@ void add_observations(PyPosterior& self, Observations more, const CsvTable& log,
     return;
   }
   // a step that is refused undoes those before it
-  const auto undo = [&file, prior = file.prior_options, draws = file.report.draws, logs = file.logs, source = file.data_source,
-                     said = file.notes] {
+  const auto undo = [&file, prior = file.prior_options, draws = file.report.draws, distrusted = file.report.distrusted,
+                     logs = file.logs, source = file.data_source, said = file.notes] {
     file.prior_options = prior;
     file.report.draws = draws;
+    file.report.distrusted = distrusted;
     file.notes = said;
     file.logs = logs;
     file.data_source = source;
@@ -333,6 +334,7 @@ void add_observations(PyPosterior& self, Observations more, const CsvTable& log,
   Posterior next = self.posterior;
   try {
     if (request.forget) next = forget(std::move(next), *request.forget);
+    make_room(next, file, more, request);
     next = with_more(std::move(next), file, std::move(more), log, notes);
     keep_newest(next, file, request);
   } catch (...) {
@@ -646,13 +648,18 @@ std::vector<std::string> export_posterior(const PyPosterior& self, const py::obj
   const std::filesystem::path to = path_argument(folder, "folder");
   const PyPosterior held = self;
   const ExportOutcome outcome = unlocked([&] { return export_fit(held.file, held.posterior, request); });
-  tell(outcome.notes);
   std::vector<std::pair<std::filesystem::path, std::string>> files;
   std::vector<std::string> written;
   for (const auto& [name, text] : outcome.files) {
+    std::error_code not_there;
+    if (request.is_of_robot() && std::filesystem::equivalent(to / name, outcome.robot, not_there)) {
+      throw InputError(fmt::format("folder {}: {} is the robot's own file, which would be lost; choose another folder or name",
+                                   to.string(), (to / name).string()));
+    }
     files.emplace_back(to / name, text);
     written.push_back((to / name).string());
   }
+  tell(outcome.notes);
   std::error_code error;
   std::filesystem::create_directories(to, error);
   if (error) throw InputError(fmt::format("folder {}: the folder cannot be made: {}", to.string(), error.message()));
@@ -669,8 +676,8 @@ void define_export(py::class_<PyPosterior>& posterior) {
                 (signature("export", "self: Posterior, folder: str | os.PathLike, system: System | None = None, *,",
                            options(request), "", "list[str]") +
                  R"(
-Write the posterior as C for machines without gp2, or a robot's parameters into its own file, as gp2 export: the paths of the files,
-in a folder that exists.
+Write the posterior as C for machines without gp2, or a robot's parameters into its own file, as gp2 export: the paths of the files.
+A folder that does not exist is made.
 
 )" + documentation(options(request)))
                     .c_str());

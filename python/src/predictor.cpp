@@ -1,8 +1,10 @@
 #include "gp2/predictor.hpp"
 
 #include <cmath>
+#include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 #include <pybind11/stl.h>
 
 #include "arrays.hpp"
@@ -28,6 +30,25 @@ Numbers numbers_of(const py::object& given, const std::vector<std::string>& name
   return vector_argument(given, names, what);
 }
 
+// @throws InputError naming the entries that are read and are not finite, where there are some
+void require_finite(const Numbers& x, const std::vector<std::string>& names, const std::vector<bool>& reads, const char* what) {
+  std::vector<std::string> faults;
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const double value = x.data()[k];
+    if (reads[k] && !std::isfinite(value)) faults.push_back(fmt::format("{} is {}", names[k], value));
+  }
+  if (faults.empty()) return;
+  throw InputError(fmt::format("{}: {}; what is read must be finite", what, fmt::join(faults, ", ")));
+}
+
+// Of the entries of a state, which a prior or a view of it reads.
+std::vector<bool> entries_read(const Prior& prior, const View& view) {
+  std::vector<bool> reads = prior.reads();
+  const std::vector<bool> of_view = view.reads(*prior.system);
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k];
+  return reads;
+}
+
 Eigen::Map<const Eigen::VectorXd> map(const Numbers& x) { return {x.data(), x.size()}; }
 Eigen::Map<Eigen::VectorXd> map_out(py::array_t<double>& x) { return {x.mutable_data(), x.size()}; }
 
@@ -49,23 +70,25 @@ Predictor::Storage storage_argument(const std::string& storage) {
 /// interpreter's lock: then each call has its own memory.
 class PyPredictor {
  public:
-  PyPredictor(const PyPosterior& posterior, const View& view, const Predictor::Options& options)
+  /// @param reads  of the entries of a state, which are read
+  PyPredictor(const PyPosterior& posterior, const View& view, const Predictor::Options& options, std::vector<bool> reads)
       : predictor_(posterior.posterior, view, options),
         workspace_(predictor_.make_workspace()),
         model_has_code_(posterior.file.model.code),
-        names_(posterior.system().state_names()) {}
+        names_(posterior.system().state_names()),
+        reads_(std::move(reads)) {}
 
   py::array_t<double> mean(const py::object& state) {
     const auto x = state_of(state);
     py::array_t<double> mean(rows());
-    require([&](Predictor::Workspace& workspace) { return predictor_.mean(map(x), map_out(mean), workspace); });
+    require(x, [&](Predictor::Workspace& workspace) { return predictor_.mean(map(x), map_out(mean), workspace); });
     return mean;
   }
 
   py::tuple mean_and_std(const py::object& state) {
     const auto x = state_of(state);
     py::array_t<double> mean(rows()), stddev(rows());
-    require([&](Predictor::Workspace& workspace) {
+    require(x, [&](Predictor::Workspace& workspace) {
       return predictor_.mean_and_stddev(map(x), map_out(mean), map_out(stddev), workspace);
     });
     return py::make_tuple(mean, stddev);
@@ -75,7 +98,7 @@ class PyPredictor {
     const auto x = state_of(state);
     py::array_t<double> mean(rows());
     Symmetric covariance(rows());
-    require([&](Predictor::Workspace& workspace) {
+    require(x, [&](Predictor::Workspace& workspace) {
       return predictor_.mean_and_covariance(map(x), map_out(mean), covariance.matrix, workspace);
     });
     return py::make_tuple(mean, covariance.array);
@@ -86,15 +109,16 @@ class PyPredictor {
     py::array_t<double, py::array::f_style> jacobian({static_cast<py::ssize_t>(rows()), std::ssize(names_)});
     py::array_t<double> mean(rows());
     Eigen::Map<Eigen::MatrixXd> columns(jacobian.mutable_data(), rows(), std::ssize(names_));
-    require(
-        [&](Predictor::Workspace& workspace) { return predictor_.mean_and_jacobian(map(x), map_out(mean), columns, workspace); });
+    require(x, [&](Predictor::Workspace& workspace) {
+      return predictor_.mean_and_jacobian(map(x), map_out(mean), columns, workspace);
+    });
     return py::make_tuple(mean, jacobian);
   }
 
   double distance_from_data(const py::object& state) {
     const auto x = state_of(state);
     double distance = 0;
-    require([&](Predictor::Workspace& workspace) {
+    require(x, [&](Predictor::Workspace& workspace) {
       distance = predictor_.distance_from_data(map(x), workspace);
       if (!std::isnan(distance)) return Predictor::Status::ok;
       Eigen::VectorXd mean(rows());
@@ -109,13 +133,13 @@ class PyPredictor {
   [[nodiscard]] Numbers state_of(const py::object& state) const { return numbers_of(state, names_, "state"); }
 
   template <typename Call>
-  void require(const Call& call) {
-    if (!model_has_code_) return require_ok(call(workspace_));
+  void require(const Numbers& state, const Call& call) {
+    if (!model_has_code_) return require_ok(call(workspace_), state);
     Predictor::Workspace own = predictor_.make_workspace();
-    require_ok(call(own));
+    require_ok(call(own), state);
   }
 
-  static void require_ok(Predictor::Status status) {
+  void require_ok(Predictor::Status status, const Numbers& state) const {
     switch (status) {
       case Predictor::Status::ok:
         return;
@@ -132,6 +156,7 @@ class PyPredictor {
       case Predictor::Status::contradicting_constraints:
         throw InputError("state: the constraints contradict each other there: no acceleration satisfies A ddq = b");
       case Predictor::Status::not_finite:
+        require_finite(state, names_, reads_, "state");
         throw InputError("state: a number that is read, or what the model makes of it, is not finite");
     }
   }
@@ -140,25 +165,28 @@ class PyPredictor {
   Predictor::Workspace workspace_;
   bool model_has_code_ = false;
   std::vector<std::string> names_;  // of a state
+  std::vector<bool> reads_;         // of its entries, which are read
 };
 
 PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const PySystem* system,
                  const std::optional<std::string>& latent, const std::optional<double>& dt, bool std, bool jacobian,
                  const std::string& storage) {
   const ViewRequest request{quantity_argument(quantity), dt, latent, model_of(system)};
-  const View view = predicted_view(posterior.file, posterior.posterior.prior(), request).view;
-  return {posterior, view, {std, jacobian, storage_argument(storage)}};
+  const PredictedView at = predicted_view(posterior.file, posterior.posterior.prior(), request);
+  return {posterior, at.view, {std, jacobian, storage_argument(storage)}, entries_read(at.prior, at.view)};
 }
 
 /// Inverse dynamics and the memory of its caller, as PyPredictor.
 class PySolver {
  public:
-  PySolver(const PyPosterior& posterior, const View& view, const InverseDynamicsSolver::Options& options)
+  /// @param reads  of the entries of a state, which must be finite
+  PySolver(const PyPosterior& posterior, const View& view, const InverseDynamicsSolver::Options& options, std::vector<bool> reads)
       : solver_(posterior.posterior, view, options),
         workspace_(solver_.make_workspace()),
         model_has_code_(posterior.file.model.code),
         names_(posterior.system().state_names()),
         wanted_names_(view.names(posterior.system())),
+        reads_(std::move(reads)),
         nu_(posterior.system().layout().nu) {}
 
   py::array_t<double> inputs(const py::object& state, const py::object& accelerations) {
@@ -183,18 +211,20 @@ class PySolver {
   void require(const py::object& state, const py::object& accelerations, const Call& call) {
     const Numbers x = numbers_of(state, names_, "state");
     const Numbers wanted = numbers_of(accelerations, wanted_names_, "accelerations");
-    if (!model_has_code_) return require_ok(call(map(x), map(wanted), workspace_));
+    if (!model_has_code_) return require_ok(call(map(x), map(wanted), workspace_), x, wanted);
     InverseDynamicsSolver::Workspace own = solver_.make_workspace();
-    require_ok(call(map(x), map(wanted), own));
+    require_ok(call(map(x), map(wanted), own), x, wanted);
   }
 
-  static void require_ok(InverseDynamicsSolver::Status status) {
+  void require_ok(InverseDynamicsSolver::Status status, const Numbers& state, const Numbers& wanted) const {
     switch (status) {
       case InverseDynamicsSolver::Status::ok:
         return;
       case InverseDynamicsSolver::Status::no_prediction:
+        require_finite(state, names_, reads_, "state");
         throw InputError("state: there is no prediction with these inputs; Predictor.mean_and_jacobian says why");
       case InverseDynamicsSolver::Status::not_finite:
+        require_finite(wanted, wanted_names_, std::vector<bool>(wanted_names_.size(), true), "accelerations");
         throw InputError("accelerations: one that is wanted is not a finite number");
       case InverseDynamicsSolver::Status::not_found:
         throw NumericalError("state: no inputs are found that produce the accelerations, or come nearest to them");
@@ -205,6 +235,7 @@ class PySolver {
   InverseDynamicsSolver::Workspace workspace_;
   bool model_has_code_ = false;
   std::vector<std::string> names_, wanted_names_;  // of a state, and of its accelerations
+  std::vector<bool> reads_;                        // of the entries of a state, which must be finite
   Eigen::Index nu_ = 0;
 };
 
@@ -214,7 +245,11 @@ PySolver make_solver(const PyPosterior& posterior, const GivenNames& outputs, co
   View view{View::Quantity::constrained_acceleration,
             acceleration_rows(*at.model->system, names_or_all(outputs, "outputs"), "`outputs`")};
   view.other_system = at.other_system;
-  return {posterior, view, {cov, storage_argument(storage)}};
+  std::vector<bool> reads = entries_read(at.prior, view);
+  const StateLayout layout = at.model->system->layout();
+  for (int k = 0; k < layout.nu; ++k)
+    reads[static_cast<std::size_t>(layout.u(k))] = false;  // the search begins at 0 where one is NaN
+  return {posterior, view, {cov, storage_argument(storage)}, std::move(reads)};
 }
 
 }  // namespace

@@ -19,9 +19,13 @@ std::shared_ptr<const Model> model_argument(const py::object& system) {
   return std::make_shared<const Model>(Model::read(path_argument(system, "system")));
 }
 
+std::filesystem::path file_of(const py::object& fit) {
+  return path_argument(fit, "fit", "a gp2.Posterior or the path of a FIT.json");
+}
+
 Report collected(const py::object& fit, const ReportRequest& request, std::vector<std::string>& notes) {
   if (!py::isinstance<PyPosterior>(fit)) {
-    const std::filesystem::path path = path_argument(fit, "fit");
+    const std::filesystem::path path = file_of(fit);
     return unlocked([&] { return collect_report(path, request, notes); });
   }
   const auto& self = fit.cast<const PyPosterior&>();
@@ -76,7 +80,7 @@ std::string plot_fit(const py::object& fit, const py::object& path, const py::kw
     const Posterior posterior = self.posterior;
     svg = picture(posterior, self.file.model);
   } else {
-    const FitFile file = read_fit(fit);
+    const FitFile file = unlocked([from = file_of(fit)] { return FitFile::read(from); });
     svg = picture(unlocked([&] { return file.posterior(); }), file.model);
   }
   if (!path.is_none()) write_file(path_argument(path), svg);
@@ -122,8 +126,8 @@ py::dict compared(const PyPosterior& self, const py::object& data, const PySyste
     return to_rows(std::move(rows));
   };
   return py::dict("outputs"_a = found.outputs, "measured"_a = to_rows(found.measured), "mean"_a = of_outputs(found.predicted),
-                  "std"_a = of_outputs(found.stddev), "levels"_a = to_vector(std::move(levels)),
-                  "coverage"_a = to_vector(shares.col(shares.cols() - 1)));
+                  "std"_a = of_outputs(found.stddev), "noise"_a = to_rows(found.noise_stddev),
+                  "levels"_a = to_vector(std::move(levels)), "coverage"_a = to_vector(shares.col(shares.cols() - 1)));
 }
 
 }  // namespace

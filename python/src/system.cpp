@@ -7,6 +7,7 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/derive.hpp"
@@ -153,18 +154,22 @@ CsvTable generate_table(const PySystem& self, std::optional<int> n, std::uint64_
   return as_table(data, self.system(), fmt::format("data of '{}'", self.system().name()));
 }
 
-std::string show_system(const PySystem& self, const py::kwargs& keywords) {
+std::string show_any(const py::object& shown, const py::kwargs& keywords) {
   ShowRequest asked;
-  read_keywords("show", keywords, options(asked), {});
-  return show(*self.model, asked);
-}
-
-std::string show_posterior(const PyPosterior& self, const py::kwargs& keywords) {
-  ShowRequest asked;
-  read_keywords("show", keywords, options(asked), {});
-  FitFile fit = self.file;
-  fit.take_data(self.posterior);
-  return show(fit, asked, [](const std::string& note) { return with_keywords(note); });
+  read_keywords("show", keywords, options(asked), {"system"});
+  const auto spelled = [](const std::string& note) { return with_keywords(note); };
+  if (py::isinstance<PySystem>(shown)) return show(*shown.cast<const PySystem&>().model, asked);
+  if (py::isinstance<PyPosterior>(shown)) {
+    const auto& self = shown.cast<const PyPosterior&>();
+    FitFile fit = self.file;
+    fit.take_data(self.posterior);
+    return show(fit, asked, spelled);
+  }
+  const std::string path = path_argument(shown, "system", "a gp2.System, a gp2.Posterior or the path of a file of one");
+  const std::string text = read_file(path);
+  const std::size_t first = text.find_first_not_of(" \t\r\n");
+  const bool is_fit = first != std::string::npos && text[first] == '{';  // JSON
+  return is_fit ? show(FitFile::parse(text, path), asked, spelled) : show(Model::parse(text, path), asked);
 }
 
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const py::kwargs& keywords) {
@@ -377,14 +382,15 @@ void define_show_derive_and_resample(py::module_& module) {
   ResampleOptions of_resample;
   py::options own_signature;
   own_signature.disable_function_signatures();
-  module.def("show", &show_system, py::arg("system"),
-             (signature("show", "system: System | Posterior, *,", options(of_show), "", "str") + R"(
+  module.def("show", &show_any, py::arg("system"),
+             (signature("show", "system: System | Posterior | str | os.PathLike, *,", options(of_show), "", "str") + R"(
 M, F, the constraints with the A and b derived from them, the parameters and the latents, as text to print; of a fit, first what it
 was learned from and what it found.
 
+system  a System or a Posterior, or the path of a file of one
+
 )" + documentation(options(of_show)))
                  .c_str());
-  module.def("show", &show_posterior, py::arg("posterior"), "The same of a Posterior.");
   module.def("derive", &derive_table, py::arg("system"), py::arg("data"), py::arg("like") = py::none(),
              (signature("derive", "system: System, data: object, like: object = None, *,", options(of_derive), "",
                         "tuple[Table, dict[str, Any]]") +

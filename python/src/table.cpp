@@ -55,7 +55,7 @@ bool is_path(const py::object& given) { return py::isinstance<py::str>(given) ||
 CsvTable make_table(const py::object& columns, const std::optional<std::string>& name) {
   if (name && is_path(columns)) return CsvTable::parse(read_file(path_argument(columns)), *name);
   CsvTable table = to_table(columns, name.value_or("data"), CsvTable::Keep::text);
-  return !name || *name == table.name() ? table : CsvTable::parse(table.text(), *name);
+  return !name || *name == table.name() ? table : table.renamed(*name);
 }
 
 py::array column_of(const CsvTable& table, const std::string& name) {
@@ -75,9 +75,9 @@ py::array column_of(const CsvTable& table, const std::string& name) {
 
 }  // namespace
 
-std::string path_argument(const py::object& path, const std::string& name) {
+std::string path_argument(const py::object& path, const std::string& name, const char* expected) {
   if (!is_path(path) && !py::isinstance<py::bytes>(path)) {
-    throw py::type_error(fmt::format("{}: expected a path, got {}", name, std::string(py::repr(path))));
+    throw py::type_error(fmt::format("{}: expected {}, got {}", name, expected, std::string(py::repr(path))));
   }
   return py::bytes(py::module_::import("os").attr("fsencode")(path));
 }
@@ -92,7 +92,7 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
                     "mapping of column names to arrays; got {}",
                     what, std::string(py::str(py::type::of(data)))));
   }
-  require_once(*names, what);
+  require_names(*names, what);
   std::vector<CsvTable::Column> columns;
   for (const py::handle key : *names) {
     std::string name = py::str(key);
@@ -126,10 +126,15 @@ void add_table(py::module_& module) {
            "to.\n\n"
            "Raises KeyError when there is none, InputError when some cells are numbers and one is not.")
       // names and cells of a file need not be UTF-8
-      .def(py::pickle([](const CsvTable& table) { return py::make_tuple(py::bytes(table.name()), py::bytes(table.text())); },
-                      [](const py::tuple& state) {
-                        return CsvTable::parse(std::string(state[1].cast<py::bytes>()), std::string(state[0].cast<py::bytes>()));
-                      }))
+      .def(py::pickle(
+          [](const CsvTable& table) {
+            return py::make_tuple(py::bytes(table.name()), py::bytes(table.text()), table.has_lines());
+          },
+          [](const py::tuple& state) {
+            CsvTable table = CsvTable::parse(std::string(state[1].cast<py::bytes>()), std::string(state[0].cast<py::bytes>()));
+            const bool has_lines = state.size() < 3 || state[2].cast<bool>();
+            return has_lines ? table : table.without_lines();
+          }))
       .def("__repr__", [](const CsvTable& table) {
         return fmt::format("<gp2.Table '{}': {} rows of {}>", table.name(), table.n_rows(), fmt::join(table.header(), ", "));
       });

@@ -168,6 +168,7 @@ struct CsvTable::Content {
   std::vector<std::string> header;
   std::vector<std::vector<double>> columns;  // NaN where a cell is empty or no finite number
   std::vector<int> lines;                    // line in the file of each row
+  bool has_lines = true;                     // false where the rows were never lines of a text
   CellTexts texts;                           // by row · n_columns + column
 
   [[nodiscard]] std::optional<std::string_view> text(int row, int column) const {
@@ -514,6 +515,7 @@ CsvTable CsvTable::from_columns(std::string name, std::vector<Column> columns) {
   for (const Column& column : columns) content.header.push_back(column.name);
   check_columns(columns, content.header, name);
   content.name = std::move(name);
+  content.has_lines = false;
   content.lines.resize(n_rows_of(columns.front()));
   std::iota(content.lines.begin(), content.lines.end(), 2);  // the header is line 1
 
@@ -534,6 +536,20 @@ CsvTable CsvTable::from_columns(std::string name, std::vector<Column> columns) {
   return CsvTable(std::make_shared<const Content>(std::move(content)));
 }
 
+CsvTable CsvTable::renamed(std::string name) const {
+  Content content = *content_;
+  content.name = std::move(name);
+  content.file.reset();
+  return CsvTable(std::make_shared<const Content>(std::move(content)));
+}
+
+CsvTable CsvTable::without_lines() const {
+  Content content = *content_;
+  content.has_lines = false;
+  std::iota(content.lines.begin(), content.lines.end(), 2);  // the header is line 1
+  return CsvTable(std::make_shared<const Content>(std::move(content)));
+}
+
 CsvTable CsvTable::first_rows(int n) const {
   std::vector<int> rows(static_cast<std::size_t>(std::clamp(n, 0, n_rows())));
   std::iota(rows.begin(), rows.end(), 0);
@@ -543,6 +559,7 @@ CsvTable CsvTable::first_rows(int n) const {
 CsvTable CsvTable::take(const std::vector<int>& rows) const {
   Content taken;
   taken.name = name();
+  taken.has_lines = has_lines();
   taken.header = header();
   taken.columns.resize(header().size());
   for (const int row : rows) {
@@ -683,6 +700,8 @@ bool CsvTable::is_text(int column) const {
 
 int CsvTable::line(int row) const { return content_->lines[static_cast<std::size_t>(row)]; }
 
+bool CsvTable::has_lines() const { return content_->has_lines; }
+
 int CsvTable::find(std::string_view column) const {
   for (int k = 0; k < n_columns(); ++k) {
     if (header()[static_cast<std::size_t>(k)] == column) return k;
@@ -701,7 +720,9 @@ bool CsvTable::is_empty(int row, int column) const {
 }
 
 std::string CsvTable::place(int row, int column) const {
-  return fmt::format("{}:{}: column '{}'", name(), line(row), header()[static_cast<std::size_t>(column)]);
+  const std::string& of = header()[static_cast<std::size_t>(column)];
+  if (!has_lines()) return fmt::format("{}: row {}, column '{}'", name(), line(row) - 1, of);  // the header is line 1
+  return fmt::format("{}:{}: column '{}'", name(), line(row), of);
 }
 
 double CsvTable::number(int row, int column) const {

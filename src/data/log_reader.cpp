@@ -105,7 +105,12 @@ const char* LogReader::mend_for_missing(const std::string& name) const {
   };
   if (lacks_all([](const Coordinate& one) { return one.acceleration(); }))
     return "It has no accelerations: gp2 derive computes them from positions over time, as a fit of a raw log does; or";
-  if (lacks_all([](const Coordinate& one) { return one.velocity(); }))
+  // a raw log may lack coordinates that the constraints decide
+  const std::vector<Coordinate>& coordinates = system_.coordinates();
+  const bool is_raw = std::ranges::count(coordinates, name, &Coordinate::name) > 0 &&
+                      std::ranges::any_of(coordinates, [&](const Coordinate& one) { return has(one.name); }) &&
+                      std::ranges::none_of(coordinates, [&](const Coordinate& one) { return has(one.velocity()); });
+  if (is_raw || lacks_all([](const Coordinate& one) { return one.velocity(); }))
     return "It has no velocities: gp2 derive computes them from positions over time, as a fit of a raw log does; or";
   return "Rename it, or";
 }
@@ -159,7 +164,8 @@ MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
     const int column = require(names[k]);
     const auto row_of_values = static_cast<Index>(k);
     values.row(row_of_values) = numbers_of(table_, column, &CsvTable::number_or_empty);
-    require_a_number(values.row(row_of_values), table_, column, "observe others (`observe`)");
+    require_a_number(values.row(row_of_values), table_, column,
+                     "choose others with `observe` of a fit, `outputs` of an evaluation");
   }
   return values;
 }

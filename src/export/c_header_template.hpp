@@ -18,7 +18,8 @@ inline constexpr std::string_view header_template = R"c(/* @title@
 @view@
  *
  * The functions allocate nothing and keep nothing: whoever calls from several threads gives each a workspace of its own.
- * They must not be compiled with options that let the compiler assume finite numbers (-ffast-math).
+ * They must not be compiled with options that let the compiler assume finite numbers (-ffast-math,
+ * -ffinite-math-only).
  */
 #ifndef @guard@
 #define @guard@

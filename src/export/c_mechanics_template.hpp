@@ -11,8 +11,8 @@ inline constexpr std::string_view mechanics_template = R"c(/* @title@ See @name@
 
 #include <math.h>
 
-#ifdef __FAST_MATH__
-#error "@name@: compile without -ffast-math, which takes NaN and infinity away"
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "@name@: compile without -ffast-math and -ffinite-math-only, which take NaN and infinity away"
 #endif
 
 typedef @name@_real real;
@@ -385,6 +385,7 @@ static void invert_R_transposed(workspace *w)
 static void decompose_rows(workspace *w)
 {
   w->rank = pivoted_qr(NQ, NC, w->B, w->tau, w->order, @rank_tolerance@);
+{redundant}  if (w->rank > @largest_rank@) w->rank = @largest_rank@; /* off the constraints redundant rows seem to be independent */
   for (int i = 0; i < NQ * NC; ++i) w->L[i] = 0;
   if (w->rank == 0) { /* nothing constrains the motion */
     for (int i = 0; i < NQ * NQ; ++i) w->T[i] = i % (NQ + 1) == 0;
@@ -407,6 +408,7 @@ static void decompose_rows(workspace *w)
 /* Whether no acceleration satisfies A ddq = b: A L b is off b by more than rounding of what accelerates the system, b and F. */
 static int is_contradictory(workspace *w)
 {
+{redundant}  if (w->rank == @largest_rank@) return 0; /* redundant rows are off b by the error of the state */
   real inconsistency = 0, size_of_b = 0, size_of_force = 0;
   for (int k = 0; k < NC; ++k) {
     real off = w->b_unit[k];

@@ -27,10 +27,13 @@ const std::set<std::string>& taken_names() {
       "double", "else", "enum", "extern", "false", "float", "for", "goto", "if", "inline", "int", "linux", "long", "nullptr",
       "register", "restrict", "return", "short", "signed", "sizeof", "static", "struct", "switch", "true", "typedef", "typeof",
       "static_assert", "thread_local", "union", "unix", "unsigned", "void", "volatile", "while", "state", "w", "real", "out",
-      "parameters", "status", "workspace",
+      "parameters", "status", "workspace", "evaluate",
       // macros of math.h
-      "NAN", "INFINITY", "HUGE_VAL", "M_E", "M_LOG2E", "M_LOG10E", "M_LN2", "M_LN10", "M_PI", "M_PI_2", "M_PI_4", "M_1_PI",
-      "M_2_PI", "M_2_SQRTPI", "M_SQRT2", "M_SQRT1_2"};
+      "NAN", "INFINITY", "HUGE_VAL", "HUGE_VALF", "HUGE_VALL", "NULL", "MAXFLOAT", "FP_NAN", "FP_INFINITE", "FP_ZERO",
+      "FP_NORMAL", "FP_SUBNORMAL", "FP_ILOGB0", "FP_ILOGBNAN", "FP_FAST_FMA", "FP_FAST_FMAF", "FP_FAST_FMAL", "MATH_ERRNO",
+      "MATH_ERREXCEPT", "math_errhandling", "signgam", "M_E", "M_LOG2E", "M_LOG10E", "M_LN2", "M_LN10", "M_PI", "M_PI_2",
+      "M_PI_4", "M_1_PI", "M_2_PI", "M_2_SQRTPI", "M_SQRT2", "M_SQRT1_2", "M_TWOPI", "M_3PI_4", "M_SQRTPI", "M_SQRT3", "M_LN2LO",
+      "M_LN2HI", "M_IVLN10", "M_INVLN2", "M_LOG2_E"};
   return names;
 }
 
@@ -182,6 +185,7 @@ void Writer::set_conditions() {
   set("answers", has("responds") || has("by_load"));
   // constraints, more than one
   set("rows", system().nc() > 0);
+  set("redundant", system().largest_rank() < system().nc());
   set("several", system().nc() > 1);
   // a latent is multiplied by M^-1; or it or mu is
   set("forced_latent", any([](const Term& term) { return term.is_forced(); }));
@@ -242,6 +246,7 @@ void Writer::set_sizes() {
       {"semidefinite", single ? "5e-6f" : "1e-13"},
       {"singular", single ? "1e-4f" : number(UdwadiaKalaba::mass_tolerance)},
       {"rank_tolerance", single ? "1e-5f" : number(UdwadiaKalaba::rank_tolerance)},
+      {"largest_rank", std::to_string(system().largest_rank())},
       {"consistency", single ? "1e-3f" : number(UdwadiaKalaba::consistency_tolerance)},
       {"well_conditioned", single ? "1e-2f" : "1e-4"},
       {"small_norm", single ? "1e-15f" : "1e-140"},

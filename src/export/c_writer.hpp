@@ -102,7 +102,14 @@ class Writer {
   // c_self_test.cpp
   void write_tests();
   void require_single_precision() const;
-  [[nodiscard]] std::pair<double, double> rounding_at(const Eigen::VectorXd& state, double prior_stddev) const;
+  [[noreturn]] void throw_untestable(const Eigen::MatrixXd& observed) const;
+  [[nodiscard]] Eigen::VectorXd cancelled_at(const Eigen::VectorXd& state) const;
+  [[nodiscard]] double steepest_scale() const;
+  [[nodiscard]] double rounding_of_variance() const;
+  [[nodiscard]] int rank_at(const Eigen::VectorXd& state) const;
+  [[nodiscard]] double require_fine_state(const Predictor& predictor, Predictor::Workspace& workspace,
+                                          const Eigen::VectorXd& state, const Eigen::VectorXd& mean,
+                                          const Eigen::VectorXd& variance, double allowed) const;
 
   // c_source.cpp
   void write_comments();

@@ -1,10 +1,14 @@
 #include "export/shims.hpp"
 
+#include <algorithm>
+#include <set>
+
 #include <fmt/format.h>
 
 #include "export/fill_template.hpp"
 #include "export/shim_template.hpp"
 #include "gp2/base/file.hpp"
+#include "symbolic/functions.hpp"
 
 namespace gp2 {
 
@@ -19,6 +23,20 @@ std::string pattern(int rows, int columns, bool is_dense = true) {
 }
 
 }  // namespace
+
+bool is_casadi_name(const std::string& name) { return name.front() != '_' && name.find("__") == std::string::npos; }
+
+bool is_taken_in_casadi(const std::string& name) {
+  // a function `set` would have the size of its memory in `set_work`
+  static const std::set<std::string> taken = {"NQ", "NU", "NX", "NR", "WORK", "of_coordinates", "of_time", "of_inputs", "of_rows",
+                                              "of_nothing", "patterns_in", "names_in", "read_state", "set", "set_work",
+                                              "rows_by_coordinates", "rows_by_time", "rows_by_inputs", "casadi_real",
+                                              "casadi_int",
+                                              // functions of the C library that expressions and portable functions call
+                                              "pow", "frexp", "ldexp", "copysign", "floor"};
+  return taken.contains(name) || std::any_of(internal::functions.begin(), internal::functions.end(),
+                                             [&](const internal::Function& function) { return function.c == name; });
+}
 
 std::string casadi_source(const std::string& name, const StateLayout& layout, int n_rows, const CSourceOptions& options) {
   std::set<std::string> conditions;

@@ -7,6 +7,11 @@
 
 namespace gp2 {
 
+/// Whether CasADi takes a function of this name: it begins with a letter and has single underscores.
+bool is_casadi_name(const std::string& name);
+/// Whether NAME_casadi.c, or the libraries that it calls, have a function or a constant of this name.
+bool is_taken_in_casadi(const std::string& name);
+
 /// NAME_casadi.c: external functions of CasADi around NAME.h.
 /// @param n_rows  of the view
 std::string casadi_source(const std::string& name, const StateLayout& layout, int n_rows, const CSourceOptions& options);

@@ -239,14 +239,19 @@ std::vector<Hyperparameter>::iterator find_named(std::vector<Hyperparameter>& hy
 
 }  // namespace
 
-void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
+std::vector<Hyperparameter> read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
   ParsedJson json = parse_json(read_file(path), path);
   std::map<std::string, double> values;
+  std::vector<Hyperparameter> left_out;
   if (is_fit(json)) {
     // a fit may have had more to tune than this one; a hand-written value must mean something
     const std::vector<Hyperparameter> of_fit = hyperparameters_of(path, json);
     for (const Hyperparameter& h : of_fit) {
-      if (find_named(hyperparameters, h.name) != hyperparameters.end()) values[h.name] = h.value;
+      if (find_named(hyperparameters, h.name) != hyperparameters.end()) {
+        values[h.name] = h.value;
+      } else if (h.is_system_parameter()) {
+        left_out.push_back(h);
+      }
     }
     if (values.empty() && !of_fit.empty() && !hyperparameters.empty()) {
       throw InputError(fmt::format("{}: none of its hyperparameters, '{}' and so on, is one of this fit, '{}' and so on",
@@ -262,6 +267,7 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
     throw InputError(fmt::format("{}: expected {{\"name\": value, …}} or a file written by gp2 fit", path.string()));
   }
   set_start_values(values, path.string(), hyperparameters);
+  return left_out;
 }
 
 void set_start_values(const std::map<std::string, double>& values, const std::string& source,

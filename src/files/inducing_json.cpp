@@ -130,7 +130,8 @@ Json inducing_json(const InducingReport& inducing) {
   Json json = {{"points", points},
                {"variables", inducing.n_variables},
                {"left_out", vector_json(inducing.left_out)},
-               {"start", inducing.n_start}};
+               {"start", inducing.n_start},
+               {"starts", inducing.n_starts}};
   if (inducing.stretches) json["stretches"] = part_json(*inducing.stretches);
   if (inducing.summary) json["summary"] = summary_json(*inducing.summary);
   return json;
@@ -146,6 +147,7 @@ InducingReport inducing_from(const ParsedJson& json, const Prior& prior) {
   inducing.n_variables = integer(json.at("variables"));
   inducing.left_out = vector_from(json.at("left_out"));
   inducing.n_start = integer(json.at("start"));
+  if (json.contains("starts")) inducing.n_starts = integer(json.at("starts"));
   if (json.contains("stretches")) inducing.stretches = part_from(json.at("stretches"));
   return inducing;
 }

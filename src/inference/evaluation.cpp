@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
 #include <numbers>
 #include <set>
 #include <utility>
@@ -252,16 +253,54 @@ bool TrainingResidual::is_too_large() const {
 bool TrainingResidual::is_too_small() const { return is_of_ddq && n >= 20 && rms_in_noise < 0.5; }
 
 bool TrainingResidual::is_correlated() const {
-  return n >= 30 && serial_correlation > 0.5 && serial_correlation > 4 / std::sqrt(n);
+  return n_serial >= 30 && serial_correlation > 0.5 && serial_correlation > 4 / std::sqrt(n_serial);
 }
 
 namespace {
+
+// What residuals of consecutive states say of how they go on.
+struct SerialSums {
+  double products = 0, squares = 0;
+  int n = 0, n_pairs = 0;
+
+  void add(double z, double before) {
+    squares += z * z;
+    ++n;
+    if (std::isnan(before)) return;
+    products += z * before;
+    ++n_pairs;
+  }
+  void add(const SerialSums& more) {
+    products += more.products, squares += more.squares;
+    n += more.n, n_pairs += more.n_pairs;
+  }
+};
+
+// The serial correlation of each residual. Logs that are too short to tell by themselves tell together, each output by itself.
+void correlate(const std::vector<SerialSums>& sums, std::vector<TrainingResidual>& residuals) {
+  constexpr int enough = 64;  // values, of which TrainingResidual::is_correlated asks for no more than 0.5
+  std::map<std::string, SerialSums> of_short_logs;
+  for (std::size_t r = 0; r < residuals.size(); ++r) {
+    if (sums[r].n < enough) of_short_logs[residuals[r].output].add(sums[r]);
+  }
+  for (std::size_t r = 0; r < residuals.size(); ++r) {
+    TrainingResidual& one = residuals[r];
+    if (sums[r].n == 0) continue;
+    const bool is_short = sums[r].n < enough;
+    const SerialSums& of = is_short ? of_short_logs[one.output] : sums[r];
+    // each log has one pair less than it has values
+    const double share = is_short && of.n_pairs > 0 ? static_cast<double>(of.n) / of.n_pairs : 1;
+    one.serial_correlation = of.squares > 0 ? share * of.products / of.squares : 0;
+    one.n_serial = is_short ? of.n_pairs + 1 : of.n;
+  }
+}
 
 std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<Observations>& trusted,
                                                  const std::vector<LeaveOneOut>& left_out) {
   // of many states some are left, which do not follow each other
   const bool are_all = posterior.n_states() == n_states(posterior.observations());
   std::vector<TrainingResidual> residuals;
+  std::vector<SerialSums> serial;  // nothing where states do not follow each other
   for (std::size_t g = 0; g < left_out.size(); ++g) {
     const Observations& group = trusted[g];
     const Prior& prior = prior_of(posterior.prior(), group.view());
@@ -272,7 +311,8 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       one.group = g;
       one.is_of_ddq = group.view().is_of_ddq();
       one.output = names[static_cast<std::size_t>(k)];
-      double before = not_a_number, products = 0;
+      double before = not_a_number;
+      SerialSums in_order;
       std::vector<double> distances;
       StandardisedErrors errors;
       for (Index i = 0; i < group.n_data(); ++i) {
@@ -283,7 +323,7 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
         errors.add(error, stddev);
         one.rms += z * z;
         one.rms_in_noise += std::pow(error / of_noise, 2);
-        if (!std::isnan(before)) products += before * z;
+        in_order.add(z, before);
         before = z;
         distances.push_back(std::abs(z));
         if (!(std::abs(z) > one.farthest)) continue;
@@ -299,10 +339,11 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       one.coverage95 = errors.within.shares()[2];
       // values that sums stand for are smoothed, and so their errors; what is known of other views need not be of a motion
       const bool is_motion = are_all && !group.has_sums() && one.is_of_ddq;
-      one.serial_correlation = one.rms > 0 && is_motion ? products / one.rms : 0;
+      serial.push_back(is_motion ? in_order : SerialSums());
       for (double* const square : {&one.rms, &one.rms_in_noise}) *square = std::sqrt(*square / std::max(1, one.n));
     }
   }
+  correlate(serial, residuals);
   return residuals;
 }
 

@@ -74,7 +74,7 @@ class Distance {
 }  // namespace
 
 std::vector<int> Posterior::fewest_components(double largest_error, const std::optional<View>& view) const {
-  if (!(largest_error > 0)) throw InputError("Posterior::fewest_components: the error must be above 0");
+  if (!(largest_error > 0)) throw InputError("fewest_components: the largest error must be above 0");
   constexpr Index most_states = 300;
   const MatrixXd states = some_observed_states(*this, most_states);
   const View at = view ? *view : View::constrained_acceleration(*prior().system);

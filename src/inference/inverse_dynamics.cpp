@@ -283,7 +283,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
 
   void write_root() {
     mechanics->evaluate(state);
-    projection.compute(mechanics->M(), mechanics->A(), mechanics->b());
+    projection.compute(mechanics->M(), mechanics->A(), mechanics->b(), solver->prior.system->largest_rank());
     const std::vector<int>& rows = solver->predictor.view().rows;
     for (std::size_t i = 0; i < rows.size(); ++i) {
       for (std::size_t j = 0; j < rows.size(); ++j) {
@@ -541,7 +541,7 @@ InverseDynamicsSolver::Status InverseDynamicsSolver::inputs_and_covariance(const
                                                                            const Ref<const VectorXd>& accelerations,
                                                                            Ref<VectorXd> inputs, Ref<MatrixXd> covariance,
                                                                            Workspace& workspace) const {
-  if (!options().covariance) throw InputError("InverseDynamicsSolver: it was made without Options::covariance");
+  if (!options().covariance) throw InputError("InverseDynamicsSolver: it was made without covariances");
   require_size("InverseDynamicsSolver", "a column of the covariance", covariance.rows(), implementation().nu());
   require_size("InverseDynamicsSolver", "a row of the covariance", covariance.cols(), implementation().nu());
   const Status status = this->inputs(state, accelerations, inputs, workspace);

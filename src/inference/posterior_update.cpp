@@ -19,20 +19,17 @@ using Eigen::Index;
 
 namespace {
 
-std::shared_ptr<Posterior::Implementation> copy_of(const Posterior::Implementation& of) {
-  auto copy = std::make_shared<Posterior::Implementation>(of);
-  if (!of.prior.is_nonlinear() || of.kept) copy->latents = of.latents->clone();  // else it is conditioned anew
-  return copy;
-}
-
-// Of a nonlinear prior, where latents are linearised moves with every observation: `samples` say which there are, no matter in what
-// order. Conditioning numbers them 0, 1, … group after group; they keep the numbers that they had.
+// `samples` say which observations there are, no matter in what order. Conditioning numbers them 0, 1, … group after group; they keep
+// the numbers that they had.
 void condition_anew(Posterior::Implementation& self) {
   std::vector<std::pair<int, std::int64_t>> numbers;
   for (const Posterior::Implementation::Sample& sample : self.samples) numbers.emplace_back(sample.group, sample.number);
   std::ranges::sort(numbers);
+  self.samples.clear();
+  self.next_number = 0;
   self.latents = nullptr;
   self.about = nullptr;
+  if (numbers.empty()) return self.add_samples({}, {}, 0);  // the prior, whose groups may stay
   self.condition(1);
   for (Posterior::Implementation::Sample& sample : self.samples) {
     sample.number = numbers[static_cast<std::size_t>(sample.number)].second;
@@ -74,10 +71,11 @@ void add(Posterior::Implementation& self, Observations added, std::size_t group)
     self.values.noise_stddev.push_back(added.noise().stddev());
     self.observations.push_back(added);
   }
+  // where a nonlinear prior is linearised moves with every observation
   if (!is_linear) condition_anew(self);
 }
 
-void remove_oldest_of(Posterior::Implementation& self, int n) {
+void remove_oldest_of(Posterior::Implementation& self, int n, bool conditions_anew) {
   std::vector<Index> gone(self.samples.size());
   std::iota(gone.begin(), gone.end(), Index{0});
   const auto is_older = [&](Index i, Index j) {
@@ -91,20 +89,22 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
   std::vector<int> n_gone(self.observations.size());
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self.samples[static_cast<std::size_t>(sample)].group)];
   self.samples.resize(static_cast<std::size_t>(close_gaps(self.samples.data(), std::ssize(self.samples), gone)));
-  if (!self.prior.is_nonlinear()) self.latents->erase(gone);
+  if (!conditions_anew) self.latents->erase(gone);
   for (std::size_t group = 0; group < n_gone.size(); ++group) self.observations[group].remove_first(n_gone[group]);
   self.erase_empty_groups();
-  if (self.prior.is_nonlinear()) condition_anew(self);
+  if (conditions_anew) condition_anew(self);
 }
 
 }  // namespace
 
-std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_components() const {
+std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_components(bool conditions_anew) const {
   std::vector<std::shared_ptr<Implementation>> own;
   for (const auto& component : conditioned()) {
     // of several, one that fails must leave the others as they were; what is conditioned anew must stay if it fails
-    if (components_.size() > 1 || component.use_count() > 1 || component->prior.is_nonlinear()) {
-      own.push_back(copy_of(*component));
+    const bool is_anew = conditions_anew || component->prior.is_nonlinear();
+    if (components_.size() > 1 || component.use_count() > 1 || is_anew) {
+      own.push_back(std::make_shared<Implementation>(*component));
+      if (!is_anew || component->kept) own.back()->latents = component->latents->clone();
       continue;
     }
     // What another thread read through a copy that it has just let go was read before what is written now: to count down acquires
@@ -148,7 +148,9 @@ Posterior forget(Posterior&& posterior, double share) {
 
 Posterior remove_oldest(Posterior&& posterior, int n) {
   if (posterior.implementation().kept) {
-    throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");
+    throw InputError(
+        "remove_oldest: what was learned through inducing points cannot be taken away, since the observations themselves are not "
+        "kept; `forget` discounts it");
   }
   const std::size_t n_samples = posterior.implementation().samples.size();
   if (n < 0 || static_cast<std::size_t>(n) > n_samples) {
@@ -157,8 +159,10 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
   }
   for (const Observations& group : posterior.observations()) group.require_no_sums();
   const lapack::SingleThread single_thread;
-  const auto own = posterior.own_components();
-  for (const auto& component : own) remove_oldest_of(*component, n);
+  // to take most rows from a factor costs more than to factor what is left
+  const bool conditions_anew = posterior.prior().is_nonlinear() || static_cast<std::size_t>(n) > n_samples / 2;
+  const auto own = posterior.own_components(conditions_anew);
+  for (const auto& component : own) remove_oldest_of(*component, n, conditions_anew);
   posterior.components_.clear();
   return Posterior(Posterior::Components(own.begin(), own.end()));
 }

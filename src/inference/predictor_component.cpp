@@ -162,7 +162,8 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
   if (latent.base != Latent::Base::admissible) return;
   at.of_directions->evaluate(VectorXd::Zero(predictor->prior.system->layout().size()), at.directions);
-  at.admissible.emplace().compute(MatrixXd::Ones(predictor->prior.system->nc(), nq), at.directions.reshaped(nq, nq));
+  at.admissible.emplace(predictor->prior.system->largest_rank())
+      .compute(MatrixXd::Ones(predictor->prior.system->nc(), nq), at.directions.reshaped(nq, nq));
   at.admissible->set_functions(at.signal);
 }
 
@@ -170,7 +171,7 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
 
 Status Predictor::Implementation::evaluate_mechanics(StateEvaluator& at, Workspace::Implementation& w) const {
   if (!is_finite(at.M()) || !is_finite(at.A()) || !is_finite(at.b())) return Status::not_finite;
-  w.projection.compute(at.M(), at.A(), at.b());
+  w.projection.compute(at.M(), at.A(), at.b(), prior.system->largest_rank());
   switch (w.projection.mass_kind()) {
     case UdwadiaKalaba::Mass::positive_definite:
       break;

@@ -10,6 +10,7 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <Eigen/QR>
 
 #include "base/suggestion.hpp"
 #include "gp2/error.hpp"
@@ -20,6 +21,7 @@
 #include "inference/nonlinear_motion.hpp"
 #include "jobs/rate_check.hpp"
 #include "jobs/read_observations.hpp"
+#include "mechanics/in_blocks.hpp"
 #include "mechanics/known_multipliers.hpp"
 
 namespace gp2 {
@@ -247,11 +249,83 @@ void check_latents(const Model& model, const Eigen::MatrixXd& states, std::vecto
   LoadCheck(model, prior, states(Eigen::all, some), some).run(findings);
 }
 
+// The known force, and with [truth] what acts in truth (nq × N each).
+std::vector<Eigen::MatrixXd> forces_at(const Model& model, const Eigen::MatrixXd& states, const SystemValues& values) {
+  const System& system = *model.system;
+  std::vector<Eigen::MatrixXd> forces(1, values.force);
+  if (model.truth.empty()) return forces;
+  std::vector<Expression> added = model.truth;
+  added.insert(added.end(), model.truth_force.begin(), model.truth_force.end());
+  const Multipliers multipliers = multipliers_in(added, system);
+  const Eigen::VectorXd parameters = system.parameter_values();
+  Eigen::MatrixXd truth;
+  Tape(added, model.symbols().state_and_parameters(multipliers.variables))
+      .evaluate(multipliers.variables.empty() ? states : with_known_multipliers(system, states, parameters), parameters, truth);
+  forces.push_back(values.force + truth.bottomRows(system.nq()));
+  for (int i = 0; i < values.n_states(); ++i) forces.back().col(i) += values.M(i) * truth.col(i).head(system.nq());
+  return forces;
+}
+
+// Whether F + ∂V/∂q is larger than F at nearly all states, and its changes from state to state are, which a constant force leaves alone.
+bool contradicts(const Eigen::MatrixXd& force, const Eigen::MatrixXd& slope) {
+  const Eigen::MatrixXd rest = force + slope;
+  const auto n_worse = (rest.colwise().norm().array() > force.colwise().norm().array()).count();
+  const auto spread = [](const Eigen::MatrixXd& of) { return (of.colwise() - of.rowwise().mean()).squaredNorm(); };
+  const bool is_constant = spread(slope) < 1e-6 * slope.squaredNorm();
+  return n_worse * 10 >= 9 * force.cols() && (is_constant || spread(rest) > spread(force));
+}
+
+// A potential that the force does not come from. They are compared at rest, without inputs, at one time, and along what the constraints
+// admit: V may be written in the coordinates that they leave.
+void check_potential(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
+  constexpr Eigen::Index enough = 300;  // states, evenly taken
+  if (!model.potential || model.robot) return;
+  const System& system = *model.system;
+  const StateLayout layout = system.layout();
+  const Eigen::VectorXd parameters = system.parameter_values();
+  const Eigen::Index stride = std::max<Eigen::Index>(1, states.cols() / enough);
+  Eigen::MatrixXd at_rest = states(Eigen::all, Eigen::seq(0, Eigen::last, stride));
+  at_rest.middleRows(layout.dq(0), layout.nq).setZero();
+  at_rest.row(layout.t()).setConstant(states(layout.t(), 0));
+  at_rest.bottomRows(layout.nu).setZero();
+  const SystemValues values = system.evaluate(at_rest, parameters);
+  const SystemSymbols symbols = model.symbols();
+  std::vector<Expression> gradient;
+  for (const Expression& q : symbols.q) gradient.push_back(model.graph->differentiate(*model.potential, q));
+  Eigen::MatrixXd slope;
+  Tape(gradient, symbols.state_and_parameters()).evaluate(at_rest, parameters, slope);
+  bool is_wrong = true;
+  Eigen::Index n_compared = 0;
+  for (Eigen::MatrixXd force : forces_at(model, at_rest, values)) {
+    Eigen::MatrixXd admitted_slope = slope;
+    std::vector<int> compared;
+    for (int i = 0; i < force.cols(); ++i) {
+      if (system.nc() > 0 && values.A(i).allFinite()) {
+        const auto rows = values.A(i).completeOrthogonalDecomposition();
+        force.col(i) -= rows.solve(values.A(i) * force.col(i));
+        admitted_slope.col(i) -= rows.solve(values.A(i) * slope.col(i));
+      }
+      constexpr double rounding = 1e-9;
+      const double size = force.col(i).norm(), of_all = values.F(i).norm() + slope.col(i).norm();
+      if (std::isfinite(of_all) && std::min(size, admitted_slope.col(i).norm()) > rounding * of_all) compared.push_back(i);
+    }
+    n_compared = std::ssize(compared);
+    is_wrong = is_wrong && n_compared > 0 && contradicts(force(Eigen::all, compared), admitted_slope(Eigen::all, compared));
+  }
+  if (!is_wrong) return;
+  findings.push_back(
+      {Level::warning,
+       fmt::format("potential: at rest the force is farther from -dV/dq than from 0, at nearly all of {} states: is a "
+                   "sign, a factor or a term wrong? The energy that simulate reports has this potential",
+                   n_compared)});
+}
+
 // The system, and where that is sound what the prior asks of it.
 void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
   const System& system = *model.system;
   append(findings, check_system(system, states, system.parameter_values(), all_threads));
   if (has_error(findings)) return;
+  check_potential(model, states, findings);
   const Prior prior = make_prior(model);
   const View view = View::constrained_acceleration(system);
   const int singular = what_needs_acceleration(prior, view) ? first_singular_mass(system, states) : -1;
@@ -262,6 +336,23 @@ void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vec
   MechanicsBatch mechanics;
   evaluate_mechanics(prior, view, states.col(singular), system.parameter_values(), mechanics);
   if (mechanics.fault) findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, singular + 1)});
+}
+
+// Whether constraints say at every state how coordinate j moves, as a belt does at a constant speed: it is a combination of rows of A.
+bool is_led(const System& system, const Eigen::MatrixXd& states, int j) {
+  if (system.nc() == 0) return false;
+  const Eigen::VectorXd unit = Eigen::VectorXd::Unit(system.nq(), j);
+  bool is_led_everywhere = true;
+  in_blocks(states, 1, [&](Eigen::Index, const Eigen::Ref<const Eigen::MatrixXd>& block) {
+    const SystemValues values = system.evaluate(block, system.parameter_values());
+    for (int i = 0; is_led_everywhere && i < values.n_states(); ++i) {
+      constexpr double rounding = 1e-9;
+      const Eigen::MatrixXd rows = values.A(i).transpose();
+      is_led_everywhere =
+          rows.allFinite() && (rows * rows.completeOrthogonalDecomposition().solve(unit) - unit).norm() < rounding;
+    }
+  });
+  return is_led_everywhere;
 }
 
 // Columns that do not vary, and rows that repeat others.
@@ -282,8 +373,9 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
       findings.push_back(
           {Level::warning, fmt::format("{} is the same in every row, while the system moves: a channel that is stuck?", name)});
     };
-    if (moves && is_stuck(log.states.row(layout.dq(j)))) add(velocity);
-    if (!is_stuck(log.states.row(layout.dq(j))) && is_stuck(log.accelerations.row(j)))
+    const bool has_constant_velocity = is_stuck(log.states.row(layout.dq(j)));
+    if (has_constant_velocity && moves && !is_led(system, log.states, j)) add(velocity);
+    if (!has_constant_velocity && is_stuck(log.accelerations.row(j)) && !is_led(system, log.states, j))
       add(accelerations[static_cast<std::size_t>(j)]);
     if (is_stuck(q) && !log.states.row(layout.dq(j)).hasNaN() && !is_stuck(log.states.row(layout.dq(j))))
       add(system.coordinates()[static_cast<std::size_t>(j)].name);

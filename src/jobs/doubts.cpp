@@ -201,7 +201,12 @@ std::optional<int> lines_apart(const std::vector<std::vector<int>>& lines) {
     std::vector<int> steps(of_log.size());
     std::adjacent_difference(of_log.begin(), of_log.end(), steps.begin());
     const auto middle = steps.begin() + 1 + static_cast<std::ptrdiff_t>(steps.size() - 1) / 2;
-    std::nth_element(steps.begin() + 1, middle, steps.end());  // some lines were left out
+    std::nth_element(steps.begin() + 1, middle, steps.end());
+    // some lines may have been left out, but of lines at random none is a number of rows later
+    const auto n_steps = std::ssize(steps) - 1;
+    const auto n_equal = std::count(steps.begin() + 1, steps.end(), *middle);
+    const bool are_even = std::all_of(steps.begin() + 1, steps.end(), [&](int step) { return std::abs(step - *middle) <= 1; });
+    if (!are_even && n_equal * 10 < n_steps * 9) return std::nullopt;
     if (apart && *apart != *middle) return std::nullopt;
     apart = *middle;
   }
@@ -498,8 +503,8 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
 
 }  // namespace
 
-void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, bool has_row_order,
-                const std::vector<std::string>& held, const FittedValues& fitted_values, std::vector<std::string>& notes) {
+void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, const std::vector<std::string>& held,
+                const FittedValues& fitted_values, std::vector<std::string>& notes) {
   constexpr int enough = 1000, fewest = 10;  // values: a sign or a unit needs no more; states
   constexpr std::size_t most_logs = 10;      // each of which is asked by itself
   const Prior& prior = posterior.prior();
@@ -516,8 +521,7 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   // of many states some are kept, which do not follow each other
   const bool are_all = posterior.n_states() == n_states(all);
   const std::optional<int> apart = lines_apart(lines);
-  const auto taken =
-      has_row_order && are_all && apart && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
+  const auto taken = are_all && apart && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
   const std::vector<bool> force = system.reads(SystemPart::force), elsewhere = system.reads(SystemPart::mechanics);
   // a latent that reads an input takes up what it does otherwise
   const auto is_learned = [&](int row) {

@@ -14,9 +14,8 @@ using FittedValues = std::function<ModelValues(const std::vector<Observations>&)
 
 // Inputs that never move, inputs that act otherwise than the model says, in all logs or in one, and logs that contradict each other.
 // @param lines          per observations: the line in its log of each state; empty where it is not known
-// @param has_row_order  whether the states of an observation follow each other as they were measured
-// @param held           names of parameters that a bound or a prior holds against the data: if wrong, inputs seem wrong
-void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, bool has_row_order,
-                const std::vector<std::string>& held, const FittedValues& fitted_values, std::vector<std::string>& notes);
+// @param held  names of parameters that a bound or a prior holds against the data: if wrong, inputs seem wrong
+void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, const std::vector<std::string>& held,
+                const FittedValues& fitted_values, std::vector<std::string>& notes);
 
 }  // namespace gp2

@@ -241,6 +241,17 @@ class Search {
  private:
   using Clock = std::chrono::steady_clock;
 
+  // why a motion could not be integrated, without the options of simulate, which excite has not
+  [[nodiscard]] static std::string failure_text(std::string text) {
+    constexpr std::string_view of_simulate = "loosen the tolerances, or allow more steps (`max_steps`)";
+    if (const std::size_t at = text.find(of_simulate); at != std::string::npos) {
+      text.replace(
+          at, of_simulate.size(),
+          fmt::format("use more `rows` ({} steps of the integrator are allowed per row), or smaller limits", most_steps_per_row));
+    }
+    return text;
+  }
+
   [[nodiscard]] Candidate integrated(VectorXd coefficients) const {
     SimulateJob job = motion_;
     job.options.inputs = inputs_.at(coefficients);
@@ -248,7 +259,7 @@ class Search {
     try {
       out.motion = run_simulation(job, stop_).front();
     } catch (const NumericalError& error) {
-      if (stop_ == nullptr || !*stop_) out.failure = error.what();
+      if (stop_ == nullptr || !*stop_) out.failure = failure_text(error.what());
       return out;
     }
     out.violation = 0;

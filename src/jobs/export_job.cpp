@@ -28,14 +28,15 @@ namespace {
 using Target = ExportRequest::Target;
 
 // "a particle on a surface" -> a_particle_on_a_surface
-std::string name_of(const System& system) {
+std::string name_of(const System& system, Target to) {
   std::string name;
   for (const char c : system.name()) {
     const bool fits = std::isalnum(static_cast<unsigned char>(c)) != 0;
     if (fits || (!name.empty() && name.back() != '_')) name += fits ? c : '_';
   }
   while (name.ends_with('_')) name.pop_back();
-  return c_export::is_identifier(name) ? name : "model_" + name;
+  const bool fits = c_export::is_identifier(name) && (to != Target::casadi || !is_taken_in_casadi(name));
+  return fits ? name : "model_" + name;
 }
 
 const char* word(Target robot) { return robot == Target::urdf ? "urdf" : "mjcf"; }
@@ -59,17 +60,20 @@ void require_options(const ExportRequest& request, const std::string& name) {
     throw InputError("`float` goes with `to=c`: CasADi and acados compute in double precision");
   }
   if (request.to == Target::casadi) {
-    if (name.front() == '_' || name.find("__") != std::string::npos) {
+    if (!is_casadi_name(name)) {
       throw InputError(
           fmt::format("`name`: CasADi takes names that begin with a letter and have single underscores, got '{}'", name));
+    }
+    if (is_taken_in_casadi(name)) {
+      throw InputError(fmt::format("`name`: the code for CasADi uses '{}' itself; choose another", name));
     }
     return;
   }
   if (request.view.quantity != View::Quantity::constrained_acceleration || request.view.latent) {
     throw InputError("`to=acados` is a step of the whole motion: leave `view` and `latent` out");
   }
-  if (!request.view.time_step || !(*request.view.time_step > 0)) {
-    throw InputError("`to=acados` needs the time step of the solver: `dt=SECONDS`, positive");
+  if (!request.view.time_step || !(*request.view.time_step > 0) || std::isinf(*request.view.time_step)) {
+    throw InputError("`to=acados` needs the time step of the solver: `dt=SECONDS`, positive and finite");
   }
   if (!request.jacobian) throw InputError("`to=acados` needs the Jacobian, which was left out");
 }
@@ -125,7 +129,7 @@ std::optional<NumberDifference> first_difference(const RobotDescription& robot, 
 }  // namespace
 
 ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
-  const std::string name = request.name.empty() ? name_of(*fit.model.system) : request.name;
+  const std::string name = request.name.empty() ? name_of(*fit.model.system, request.to) : request.name;
   require_options(request, name);
   const char* const to = word(request.to);
   if (!fit.model.robot) throw InputError(fmt::format("`to={}` writes into the file of a robot, but the model has none", to));
@@ -204,16 +208,19 @@ std::vector<Option> options(ExportRequest& request) {
 
 ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const ExportRequest& request) {
   ExportOutcome out;
-  const std::string name = request.name.empty() ? name_of(*fit.model.system) : request.name;
+  const std::string name = request.name.empty() ? name_of(*fit.model.system, request.to) : request.name;
   require_options(request, name);
   if (request.is_of_robot()) return export_robot(fit, request);
   ViewRequest viewed = request.view;
   if (request.to == Target::acados) viewed.time_step.reset();
   const PredictedView at = predicted_view(fit, posterior.prior(), viewed);
+  out.notes = at.notes;
   const bool few = request.draws_within && posterior.n_components() > 1;
   const Posterior exported = few ? posterior.components(posterior.fewest_components(*request.draws_within, at.view)) : posterior;
   if (few) {
     out.notes.push_back(fmt::format("{} of {} draws represent all", exported.n_components(), posterior.n_components()));
+  } else if (request.draws_within) {
+    out.notes.emplace_back("`draws_within` changes nothing: the fit has one set of hyperparameters, not draws of them");
   }
   const CSourceOptions options{
       name,

@@ -152,33 +152,25 @@ void take_logs(const FitRequest& request, const std::vector<Observations>& obser
   if (!is_known) note_shared_rows({}, observations, notes);
 }
 
-// Whether so many observations of each log stand in its order: `max_points` shuffles them.
-bool keeps_row_order(const FitFile& fit, const std::vector<std::int64_t>& n_states) {
-  if (fit.options.empty()) return false;
-  const std::optional<int> max_points = request_of(fit).problem.max_points;
-  return std::ranges::all_of(n_states, [&](std::int64_t n) { return !max_points || n < *max_points; });
-}
-
-bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations) {
-  std::vector<std::int64_t> n_states;
-  for (const Observations& group : observations) n_states.push_back(group.n_data());
-  return keeps_row_order(fit, n_states);
-}
-
 constexpr int rows_of_stretch = 200;
 
 bool is_short(const Observations& group) { return group.n_data() <= 2 * rows_of_stretch; }
 
 // Whether a stretch of a log may tell what its rows are worth.
-bool asks_a_stretch(const FitOptions& options, const FitFile& file, const std::vector<Observations>& observations) {
-  return options.max_iterations > 0 && !std::all_of(observations.begin(), observations.end(), is_short) &&
-         keeps_row_order(file, observations);
+bool asks_a_stretch(const FitOptions& options, const std::vector<Observations>& observations) {
+  return options.max_iterations > 0 && !std::all_of(observations.begin(), observations.end(), is_short);
 }
 
-// Under mean zero the constraint forces that a latent reads are those of the latents alone.
+// Under mean zero the constraint forces λ that a latent reads are those of the latents alone, and λ₀ those of a force that does not act.
 void note_load_without_force(const FitProblem& problem, std::vector<std::string>& notes) {
   const Prior& prior = problem.prior;
-  const auto latent = std::ranges::find_if(prior.latents, &Latent::reads_multipliers);
+  const auto reads_load = [&](const Latent& one) {
+    Prior alone = prior;
+    alone.latents = {one};
+    return reads_loads(alone);
+  };
+  auto latent = std::ranges::find_if(prior.latents, &Latent::reads_multipliers);
+  if (latent == prior.latents.end()) latent = std::ranges::find_if(prior.latents, reads_load);
   if (prior.mean != Prior::Mean::zero || latent == prior.latents.end()) return;
   const Eigen::VectorXd parameters = model_values(prior, problem.observations, problem.hyperparameters).parameters;
   const auto has_force = [&](const Observations& group) {
@@ -186,9 +178,9 @@ void note_load_without_force(const FitProblem& problem, std::vector<std::string>
   };
   if (std::ranges::none_of(problem.observations, has_force)) return;
   notes.push_back(
-      fmt::format("warning: {} reads constraint forces (lambda), but the known force of [mechanics], which causes them, is not "
+      fmt::format("warning: {} reads constraint forces ({}), but the known force of [mechanics], which causes them, is not "
                   "used: fit with `mean=force`, unless other latents are to learn that force",
-                  latent->name));
+                  latent->name, latent->reads_multipliers() ? "lambda" : "lambda0"));
 }
 
 // What both kinds of preparation end with.
@@ -213,7 +205,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
     job.options = within_memory(problem, asked, free_memory(), job.notes);
     note_time(problem, job.options, fit_memory(problem, job.options).reduced_size, job.notes);
   } catch (const InputError& error) {
-    if (!job.thin || !asks_a_stretch(asked, job.file, problem.observations)) throw;
+    if (!job.thin || !asks_a_stretch(asked, problem.observations)) throw;
     job.options = asked;
     job.unaffordable = error.what();
   }
@@ -255,10 +247,13 @@ struct Worth {
   Worth(const std::vector<TrainingResidual>& residuals, const std::vector<Observations>& observations)
       : rows(observations.size(), 1), text((last_beyond_noise(residuals) ? "warning: " : "") + correlated_text(residuals)) {
     constexpr double forgotten = 0.3;
-    constexpr int fewest = 40;
+    constexpr int fewest = 40;  // of all logs together
+    int n_rows = 0;
+    for (const Observations& group : observations) n_rows += group.view().is_of_ddq() ? group.n_data() : 0;
     for (const TrainingResidual& one : residuals) {
       if (!one.is_correlated()) continue;
-      const int most = std::max(1, observations[one.group].n_data() / fewest);
+      // each log keeps a row at least
+      const int most = std::max(1, std::min(n_rows / fewest, observations[one.group].n_data()));
       const double needed = std::ceil(std::log(forgotten) / std::log(std::min(one.serial_correlation, 0.999)));
       rows[one.group] = std::max(rows[one.group], std::min(most, static_cast<int>(needed)));
     }
@@ -336,13 +331,12 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   const Posterior& posterior = outcome.posterior;
   std::vector<std::string>& notes = outcome.notes;
   std::optional<CrossValidation>& scores = outcome.cross_validation;
-  const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
   const TrustedData trusted = trusted_data(posterior, report, job.problem.lines);
   Tests tests;
   tests.run("the use of the known force", [&] { add_force_note(posterior, notes); });
   tests.run("the constraints", [&] { add_constraint_note(posterior, notes); });
   tests.run("the windows", [&] { add_window_note(posterior, notes); });
-  tests.run("the values left out", [&] { scores = cross_validate(posterior, trusted.observations, has_row_order); });
+  tests.run("the values left out", [&] { scores = cross_validate(posterior, trusted.observations, /*has_time_order=*/true); });
   if (scores && report.inducing) report.inducing->stretches = scores->stretches;
   if (report.iterations > 0) tests.run("the noise", [&] { add_noise_notes(posterior, notes); });
   if (scores) tests.run("the residuals", [&] { add_residual_notes(posterior, trusted, scores->residuals, notes); });
@@ -359,7 +353,7 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
     return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
   };
   tests.run("the inputs and the logs",
-            [&] { add_doubts(posterior, trusted.lines, has_row_order, held_parameters(report), fitted_values, notes); });
+            [&] { add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, notes); });
   const std::string correlated = scores ? correlated_text(scores->residuals) : "";
   if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: standard deviations are too small", correlated));
   tests.add_notes(notes);
@@ -401,6 +395,12 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   for (std::string& note : notes_of(result.report, outcome.posterior)) outcome.notes.push_back(std::move(note));
   explain_restitution(job.file.model, outcome.notes);
   if (result.report.inducing) add_inducing_note(*result.report.inducing, outcome.notes);
+  const bool is_once = result.report.inducing && result.report.inducing->n_start == 0 && result.report.restarts.size() == 1;
+  if (is_once && options.n_restarts > 1 && options.max_iterations > 0) {
+    outcome.notes.push_back(
+        "through inducing points so few rows are fitted from one start, the model's values, and `restarts` are not used; exact "
+        "(`inducing=none`) they are");
+  }
   if (const int n_all = n_states(job.problem.observations);
       options.n_train > 0 && options.n_train < n_all && options.max_iterations > 0) {
     outcome.notes.push_back(
@@ -479,7 +479,7 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
 // What a stretch of a long log says, before all of it is fitted at the cost of N³; nothing of a short one.
 std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>* stop) {
   const std::vector<Observations>& all = job.problem.observations;
-  if (!asks_a_stretch(job.options, job.file, all)) return std::nullopt;
+  if (!asks_a_stretch(job.options, all)) return std::nullopt;
   const FitFile file = with_states(job.file, all, [&](std::size_t g) {
     const int n = all[g].n_data(), n_taken = is_short(all[g]) ? n : rows_of_stretch;
     std::vector<int> stretch(static_cast<std::size_t>(n_taken));
@@ -584,7 +584,8 @@ std::vector<Option> options(FitRequest& request) {
                "",
                "learn ddq without mechanics (docs/priors.md), from the features and all state entries that the model reads; se: "
                "independent outputs; icm, lmc: multi-output"},
-              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those marked in the model"},
+              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate; `estimate=none`: none",
+               "those marked in the model"},
               {"protocol",
                choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
                "initial values and bounds of hyperparameters (docs/priors.md); paper: as in Geist & Trimpe 2020"},
@@ -739,7 +740,7 @@ FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
 
 CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
   CrossValidation scores =
-      cross_validate(posterior, trusted_data(posterior, fit.report).observations, keeps_row_order(fit, fit.n_states()));
+      cross_validate(posterior, trusted_data(posterior, fit.report).observations, /*has_time_order=*/!fit.options.empty());
   if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
   return scores;
 }

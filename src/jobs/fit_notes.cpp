@@ -20,6 +20,13 @@ namespace gp2 {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+void note_kept_parameter(const Parameter& there, const Model& other, const Model& fitted, std::vector<std::string>& notes) {
+  notes.push_back(
+      fmt::format("{}: parameter '{}' stays {} there while it is estimated in '{}'; mark it estimate = true there if it is one "
+                  "and the same",
+                  other.name, there.name, there.value, fitted.name));
+}
+
 void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes) {
   constexpr double much = 20;
   const std::vector<Observations>& all = posterior.observations();
@@ -322,7 +329,8 @@ std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
   double in_noise = 0;
   for (const TrainingResidual& one : residuals) {
     if (!one.is_correlated()) continue;
-    correlated.push_back(fmt::format("{} ({:.2g})", one.output, one.serial_correlation));
+    const std::string text = fmt::format("{} ({:.2g})", one.output, one.serial_correlation);
+    if (std::ranges::find(correlated, text) == correlated.end()) correlated.push_back(text);  // else of another short log
     in_noise = std::max(in_noise, one.rms_in_noise);
   }
   if (correlated.empty()) return {};

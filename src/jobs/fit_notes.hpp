@@ -12,6 +12,9 @@
 // What a person should know of a fit that has ended.
 namespace gp2 {
 
+// Says that another system keeps its value of a parameter that is estimated in the fitted one.
+void note_kept_parameter(const Parameter& there, const Model& other, const Model& fitted, std::vector<std::string>& notes);
+
 // Logs whose estimated noise is much larger than that of others: a log that contradicts them may be taken for that.
 void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes);
 

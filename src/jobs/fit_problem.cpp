@@ -2,7 +2,9 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <limits>
+#include <optional>
 #include <tuple>
 
 #include <fmt/format.h>
@@ -88,12 +90,7 @@ void note_parameters(const Model& fitted, const LoggedSystem& logged, const std:
                                   logged.model.name, name, fitted.name, parameters[k].value));
     }
     const bool tuned = std::find(estimated.begin(), estimated.end(), name) != estimated.end();
-    if (tuned && logged.other_system->shared[k] < 0) {
-      notes.push_back(
-          fmt::format("{}: parameter '{}' stays {} there while it is estimated in '{}'; mark it estimate = true "
-                      "there if it is one and the same",
-                      logged.model.name, name, parameters[k].value, fitted.name));
-    }
+    if (tuned && logged.other_system->shared[k] < 0) note_kept_parameter(parameters[k], logged.model, fitted, notes);
   }
 }
 
@@ -385,7 +382,9 @@ void note_idle_latents(FitProblem& problem) {
     const Prior& there = prior_of(problem.prior, group.view());
     acting.count(there, group.states(), parameters_of(group.view(), problem.prior.system->parameter_values()));
   }
-  for (const std::string& text : acting.idle_texts()) problem.notes.push_back("warning: " + text);
+  const bool of_accelerations =
+      std::ranges::all_of(problem.observations, [](const Observations& group) { return group.view().is_of_ddq(); });
+  for (const std::string& text : acting.idle_texts(of_accelerations)) problem.notes.push_back("warning: " + text);
 }
 
 // what the prior is made of anew, on every other system too
@@ -452,6 +451,74 @@ Observations with_windows(const Observations& rows, const Windows& windows, cons
   return sums.empty() ? rows : rows.with_sums(std::move(sums));
 }
 
+// How far what a positive latent adds stands out from the noise of each state, with its factors and with factors of 1.
+struct PositivePart {
+  std::vector<double> sizes, sizes_of_one;
+};
+
+PositivePart positive_part(const Posterior& posterior, std::size_t a) {
+  PositivePart part;
+  const Prior& fitted = posterior.prior();
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    const Observations& group = posterior.observations()[g];
+    View view = group.view();
+    if (group.has_sums() || !view.has_latent(a)) continue;
+    view.latent = static_cast<int>(a);
+    const Prior& prior = prior_of(fitted, view);
+    const VectorXd parameters = parameters_of(view, posterior.values().parameters);
+    const MechanicsBatch mechanics = require_mechanics(prior, view, group.states(), parameters);
+    std::optional<MatrixXd> load;
+    if (prior.latents[a].reads_multipliers()) {
+      View multipliers = View::multipliers(*prior.system);
+      multipliers.other_system = view.other_system;
+      load = posterior.mean(multipliers, group.states());
+    }
+    const PriorValues values = require_prior_values(prior, group.states(), parameters, mechanics, load ? &*load : nullptr);
+    const ViewValues viewed = evaluate_view(view, mechanics, group.states());
+    const MatrixXd added = posterior.mean(view, group.states());
+    const MatrixXd noise = group.noise_of_values(posterior.noise_stddev(g));  // infinite where nothing is measured
+    for (int i = 0; i < group.n_data(); ++i) {
+      part.sizes.push_back(added.col(i).cwiseQuotient(noise.col(i)).norm());
+      const MatrixXd of_one = viewed.G(i) * values.E(a, i);
+      part.sizes_of_one.push_back((noise.col(i).cwiseInverse().asDiagonal() * of_one).norm());
+    }
+  }
+  return part;
+}
+
+// Positive latents that the data push to 0 wherever they act. One that is small in part of its range, or along a direction that is
+// written large, stands out from the noise of all rows.
+void add_vanishing_notes(const Posterior& posterior, std::vector<std::string>& notes) {
+  constexpr double least = 1e-3;       // of the largest direction: elsewhere it does not act
+  constexpr double small = 0.05;       // factor
+  constexpr double nearly_all = 0.95;  // of the rows
+  constexpr double lost = 0.5;         // standard deviations of the noise, over all rows
+  const std::vector<Latent>& latents = posterior.prior().latents;
+  for (std::size_t a = 0; a < latents.size(); ++a) {
+    if (!latents[a].is_positive) continue;
+    PositivePart part;
+    try {
+      part = positive_part(posterior, a);
+    } catch (const Error&) {
+      continue;  // where a state has no motion, which is told elsewhere, there is nothing to compare
+    }
+    if (part.sizes.empty()) continue;
+    const double acts = least * std::ranges::max(part.sizes_of_one);
+    double n_acting = 0, n_small = 0, squares = 0;
+    for (std::size_t i = 0; i < part.sizes.size(); ++i) {
+      squares += part.sizes[i] * part.sizes[i];
+      if (!(part.sizes_of_one[i] > acts)) continue;
+      n_acting += 1;
+      n_small += part.sizes[i] < small * part.sizes_of_one[i] ? 1 : 0;
+    }
+    if (n_acting == 0 || n_small < nearly_all * n_acting || std::sqrt(squares) > lost) continue;
+    notes.push_back(
+        fmt::format("warning: the data push the positive latent '{}'{} to 0: is the sign of its direction wrong, or does nothing "
+                    "act along it?",
+                    latents[a].name, latents[a].direction.empty() ? "" : fmt::format(", {},", latents[a].direction)));
+  }
+}
+
 }  // namespace
 
 void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
@@ -459,8 +526,16 @@ void read_start(const NamedNumbers& start, int max_iterations, FitProblem& probl
   const auto read = [&] {
     if (start.file.empty()) {
       set_start_values(start.values, source, problem.hyperparameters);
-    } else {
-      read_start_values(start.file, problem.hyperparameters);
+      return;
+    }
+    const System& system = *problem.prior.system;
+    for (const Hyperparameter& h : read_start_values(start.file, problem.hyperparameters)) {
+      const int index = system.parameter_index(h.name);
+      if (index < 0 || system.parameter_values()[index] == h.value) continue;
+      problem.notes.push_back(
+          fmt::format("warning: {}: {} = {:.6g} is not taken: this fit does not estimate it and has {:.6g} of "
+                      "the model",
+                      source, h.name, h.value, system.parameter_values()[index]));
     }
   };
   if (max_iterations > 0) {
@@ -518,11 +593,14 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
     notes.push_back(fmt::format("{}{}. {}", note.is_warning ? "warning: " : "", note.text, note.mend));
   }
   if (!never_ran) add_few_values_note(report, posterior, notes);
+  add_vanishing_notes(posterior, notes);
   if (report.termination == FitReport::unsettled) {
-    notes.emplace_back(
+    notes.push_back(fmt::format(
         "warning: the fit has not converged: hyperparameters and the mean of nonlinear latents still changed each other. "
-        "Standard deviations may be far too small. The data may determine only the product of a load and its coefficient: fix "
-        "one of them");
+        "Standard deviations may be far too small{}",
+        reads_loads(posterior.prior())
+            ? ". The data may determine only the product of a load and its coefficient: fix one of them"
+            : ""));
   }
   if (!dependent.empty()) {
     notes.push_back(

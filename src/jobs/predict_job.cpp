@@ -151,7 +151,8 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
   const InverseDynamics found =
       at_states_of(log.name(), [&] { return inverse_dynamics(posterior, wanted.view, wanted.states, wanted.accelerations); });
   const System& system = *at.model->system;
-  PredictOutcome out{system.inputs(), {}, std::move(wanted.notes)};
+  PredictOutcome out{system.inputs(), {}, at.notes};
+  std::ranges::move(wanted.notes, std::back_inserter(out.notes));
   std::vector<MatrixXd> blocks = {found.inputs};
   if (request.covariance != PredictRequest::Covariance::none) {
     blocks.push_back(found.stddev());
@@ -289,7 +290,15 @@ std::vector<Option> options(ViewRequest& request) {
 FitSystem system_of(const FitFile& fit, const Prior& prior, const std::shared_ptr<const Model>& system) {
   if (!system || is_same(*system, fit.model)) return {&fit.model, fit.model.actuators, nullptr, prior};
   const auto other_system = make_other_system(fit.model, *system, fit.prior_options);
-  return {system.get(), shared_actuators(fit.model.actuators, *system), other_system, other_system->prior};
+  FitSystem out{system.get(), shared_actuators(fit.model.actuators, *system), other_system, other_system->prior};
+  const std::vector<Parameter>& parameters = other_system->prior.system->parameters();
+  for (const Hyperparameter& h : fit.report.hyperparameters) {
+    if (!h.is_system_parameter()) continue;
+    const int there = other_system->prior.system->parameter_index(h.name);
+    if (there < 0 || other_system->shared[static_cast<std::size_t>(there)] >= 0) continue;
+    note_kept_parameter(parameters[static_cast<std::size_t>(there)], *system, fit.model, out.notes);
+  }
+  return out;
 }
 
 PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request) {
@@ -300,6 +309,9 @@ PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewR
   const bool is_of_constraints = asked == View::Quantity::multipliers || asked == View::Quantity::constraint_force;
   if (is_of_constraints && out.prior.system->nc() == 0) {
     throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
+  }
+  if (prior.reference && asked == View::Quantity::learned_force) {
+    throw InputError("`view=force`: a baseline learns accelerations, not forces: ask for `view=constrained`");
   }
   set_time_step(out.view, request.time_step);
   if (request.latent) out.view.latent = latents_called(prior, *request.latent, "`latent`");
@@ -353,6 +365,7 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
   const std::string name = states.name();
   states = CsvTable();  // a long log in memory once
   PredictOutcome out{at.names, {}, std::move(log.notes)};
+  out.notes.insert(out.notes.begin(), at.notes.begin(), at.notes.end());
   if (request.n_samples) {
     require_memory_of_samples(posterior, at.view, log.states.cols(), *request.n_samples, free_memory());
   }
@@ -404,10 +417,11 @@ void note_differing_noise(const Posterior& posterior, const std::vector<int>& ro
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request,
                          const std::atomic<bool>* stop) {
   require_threads(request.threads);
-  EvaluateOutcome out;
   ViewRequest constrained;
   constrained.system = request.system;
   const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
+  EvaluateOutcome out;
+  out.notes = at.notes;
   const std::vector<std::string> outputs =
       request.outputs.empty() ? outputs_to_compare(posterior, *at.model, log, request.columns, out.notes) : request.outputs;
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "`outputs`");
@@ -415,6 +429,9 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
                                            parameters_of(at.view, posterior.values().parameters));
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
+  for (const std::string& text :
+       wrong_rates_of(*at.model->system, at.prior, log, checked_columns(*at.model, {&log}, request.columns)))
+    out.notes.push_back(fmt::format("warning: {}: {}", name, text));
   add_learned_note(fit, log, out.notes);
   log = CsvTable();
   EvaluationOptions options{at.view.other_system, {}, request.threads, stop};

@@ -47,7 +47,13 @@ bool has_values(LogReader& reader, const CsvTable& log, const std::string& name)
 
 void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
   std::ranges::move(reader.notes(), std::back_inserter(notes));
-  const std::vector<std::string> unused = reader.unused_columns();
+  std::vector<std::string> unused = reader.unused_columns();
+  // an empty one may be needed where it has values
+  std::erase_if(unused, [&](const std::string& name) {
+    bool is_empty = true;
+    for (int row = 0; is_empty && row < log.n_rows(); ++row) is_empty = log.is_empty(row, log.find(name));
+    return is_empty;
+  });
   if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log.name(), fmt::join(unused, ", ")));
 }
 
@@ -141,14 +147,47 @@ std::vector<int> all_rows(Index n) {
   return numbers;
 }
 
-// the first n of a shuffle of `rows`; all in order when n is no less
+// n of `rows`, chosen at random; all when n is no less
 std::vector<int> chosen_rows(const std::vector<int>& rows, int n, std::uint64_t seed) {
   const int size = static_cast<int>(rows.size());
   if (n >= size) return rows;
   std::vector<int> chosen;
   for (const int k : RandomStream(seed).permutation(size)) chosen.push_back(rows[static_cast<std::size_t>(k)]);
   chosen.resize(static_cast<std::size_t>(n));
+  std::ranges::sort(chosen);
   return chosen;
+}
+
+// Rows of a shuffled log in the order of its time, which tells whether they share their errors. Episodes stay together.
+std::vector<int> in_order_of_time(std::vector<int> rows, const System& system, const CsvTable& log,
+                                  const std::map<std::string, std::string>& columns) {
+  LogReader reader(log, system, columns);
+  if (!reader.has("t")) return rows;
+  VectorXd times;
+  try {
+    times = reader.values({"t"}).row(0).transpose();
+  } catch (const InputError&) {
+    return rows;  // not numbers: a fit that does not read them accepts that
+  }
+  const int episode_column = reader.episode_column();
+  struct Episode {
+    std::size_t number;
+    double time;  // of its last row
+  };
+  std::map<std::string, Episode> episodes;
+  std::vector<std::size_t> episode_of(static_cast<std::size_t>(log.n_rows()));
+  std::size_t n_falls = 0;
+  for (const int row : rows) {
+    const std::string name = episode_column < 0 ? "" : log.cell(row, episode_column);
+    const auto [found, is_new] = episodes.emplace(name, Episode{episodes.size(), times[row]});
+    if (times[row] < found->second.time) ++n_falls;
+    found->second.time = times[row];
+    episode_of[static_cast<std::size_t>(row)] = found->second.number;
+  }
+  // in a log of several runs without a column for them time falls once per run
+  if (n_falls * 10 <= rows.size()) return rows;
+  std::ranges::stable_sort(rows, {}, [&](int row) { return std::pair(episode_of[static_cast<std::size_t>(row)], times[row]); });
+  return rows;
 }
 
 // The rows of a log with something measured. Values without a stated deviation where others of the column have one count as
@@ -197,10 +236,10 @@ std::vector<int> lines_of(const std::vector<int>& rows, const CsvTable& log) {
 void require_mechanics_at(const LoggedSystem& logged, const View& view, const MatrixXd& states, const std::vector<int>& rows,
                           const CsvTable& log, std::vector<std::string>& notes) {
   const auto data_row = [&](int state) { return rows[static_cast<std::size_t>(state)] + 1; };
-  std::vector<int> ranks(rows.size());
+  std::vector<StateRank> ranks(rows.size());
   const auto fault =
       for_each_mechanics(logged.prior, view, states, logged.parameters, [&](Index first, const MechanicsBatch& block) {
-        const std::vector<int> here = ranks_of(logged.system(), block);
+        const std::vector<StateRank> here = ranks_of(logged.system(), block);
         std::copy(here.begin(), here.end(), ranks.begin() + first);
       });
   if (fault) {
@@ -389,14 +428,9 @@ std::optional<LoggedMotion> read_motion(const System& system, const CsvTable& lo
   }
 }
 
-// Columns that are not the rates of what they should be over the log's time, whether or not the model reads that.
 void note_rates(const LoggedSystem& logged, const CsvTable& log, const std::map<std::string, std::string>& columns,
                 std::vector<std::string>& notes) {
-  const System& system = logged.system();
-  const std::optional<LoggedMotion> motion = read_motion(system, log, columns);
-  if (!motion) return;
-  const bool reads_time = logged.prior.reads()[static_cast<std::size_t>(system.layout().t())];
-  for (const std::string& text : wrong_rates(system, motion->states, motion->accelerations, reads_time))
+  for (const std::string& text : wrong_rates_of(logged.system(), logged.prior, log, columns))
     notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
 }
 
@@ -416,6 +450,14 @@ std::vector<int> side_information_rows(const View& view, const std::vector<std::
 }
 
 }  // namespace
+
+std::vector<std::string> wrong_rates_of(const System& system, const Prior& prior, const CsvTable& log,
+                                        const std::map<std::string, std::string>& columns, double* unit) {
+  const std::optional<LoggedMotion> motion = read_motion(system, log, columns);
+  if (!motion) return {};
+  const bool reads_time = prior.reads()[static_cast<std::size_t>(system.layout().t())];
+  return wrong_rates(system, motion->states, motion->accelerations, reads_time, unit);
+}
 
 void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
                    const std::map<std::string, std::string>& columns) {
@@ -618,7 +660,8 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   readings.stated_stddev = stated_noise(logged.model, observed, options, reader, log.table, notes);
   const MatrixXd all_values = all_accelerations(system, reader, log.table);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
-  note_reading(reader, log.table, notes);
+  // a smoothed log has more columns than its windows need
+  if (!log.windows) note_reading(reader, log.table, notes);
   if (options.project) project(system, logged.parameters, log.table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, log.table, notes, &options);
   note_repeats(readings, log.table, notes);
@@ -630,12 +673,13 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   // what is learned from windows are sums over each position by itself, not these rows
   if (!log.windows) note_dependence(logged, readings, options, all_values, log.table, notes);
   keep_known(commanded, log.table, measured, notes);
-  const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
+  const std::vector<int> rows =
+      in_order_of_time(chosen_rows(measured, options.max_points.value_or(n_rows), options.seed), system, log.table, columns);
   if (rows.size() < measured.size()) {
     notes.push_back(
         fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(), options.seed));
   }
-  if (static_cast<int>(rows.size()) < n_rows) readings.keep(rows);
+  if (static_cast<int>(rows.size()) < n_rows || !std::ranges::is_sorted(rows)) readings.keep(rows);
   of_log = {lines_of(rows, log.table), of_rows(std::move(commanded), rows)};
   require_mechanics_at(logged, readings.view, readings.states, rows, log.table, notes);
   note_shared_loads(logged, readings.states, log.table, notes);
@@ -761,6 +805,10 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   const VectorXd parameters = given.value_or(prior.system->parameter_values());
   if (projects) project(*prior.system, parameters, log, state_stddevs, out.states, out.notes);
   note_violation(*prior.system, out.states, parameters, log, out.notes);
+  if (accelerations.empty()) return out;
+  if (const std::string text = text_of_rest(model, parameters, out.states, out.accelerations); !text.empty()) {
+    out.notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
+  }
   return out;
 }
 
@@ -795,28 +843,42 @@ ActingStates::ActingStates(const Prior& prior) {
     names_.push_back(latent.name);
     acts_.push_back(!latent.directions);
   }
+  moves_ = acts_;
 }
 
 void ActingStates::count(const Prior& prior, const MatrixXd& states, const VectorXd& parameters) {
   n_states_ += states.cols();
-  constexpr Index piece = 1000;  // states, of which the first tell as a rule
+  constexpr Index piece = 1000;      // states, of which the first tell as a rule
+  constexpr double rounding = 1e-9;  // of what is projected; coordinates may be in m and in mm
   const View view = View::constrained_acceleration(*prior.system);
-  for (Index from = 0; from < states.cols() && std::ranges::count(acts_, false) > 0; from += piece) {
+  for (Index from = 0; from < states.cols() && std::ranges::count(moves_, false) > 0; from += piece) {
     const MatrixXd some = states.middleCols(from, std::min(piece, states.cols() - from));
     const auto fault = for_each_mechanics(prior, view, some, parameters, [&](Index first, const MechanicsBatch& block) {
       const int n = block.values.n_states();
       const PriorValues values = evaluate_prior(prior, some.middleCols(first, n), parameters, block);
       for (std::size_t a = 0; a < acts_.size(); ++a) {
-        for (int i = 0; i < n && !acts_[a]; ++i) acts_[a] = values.fault || !values.E(a, i).isZero(0);
+        for (int i = 0; i < n && !moves_[a]; ++i) {
+          const auto E = values.E(a, i);
+          acts_[a] = acts_[a] || values.fault || !E.isZero(0);
+          moves_[a] = values.fault || (block.projections[static_cast<std::size_t>(i)].T() * E).norm() > rounding * E.norm();
+        }
       }
     });
-    if (fault) std::fill(acts_.begin(), acts_.end(), true);  // others tell
+    // others tell
+    if (fault) moves_.assign(moves_.size(), true);
+    if (fault) acts_ = moves_;
   }
 }
 
-std::vector<std::string> ActingStates::idle_texts() const {
+std::vector<std::string> ActingStates::idle_texts(bool accelerations) const {
   std::vector<std::string> warnings;
   for (std::size_t a = 0; a < acts_.size() && n_states_ > 0; ++a) {
+    if (acts_[a] && !moves_[a] && accelerations) {
+      warnings.push_back(
+          fmt::format("latent '{}' acts along the constraints, which take it up, at all of {} states: accelerations "
+                      "tell nothing of it; check the signs of its directions",
+                      names_[a], n_states_));
+    }
     if (acts_[a]) continue;
     warnings.push_back(
         fmt::format("latent '{}' acts at 0 of {} states: its direction is 0, and nothing is learned of it; check the sign of its "
@@ -868,8 +930,9 @@ std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Mo
   for (int row = 0; row < system.nq(); ++row) {
     const std::string& name = every[static_cast<std::size_t>(row)];
     const bool is_observed = std::find(observed.begin(), observed.end(), row) != observed.end();
-    if (is_observed) (reader.has(name) ? outputs : not_in_log).push_back(name);
-    if (!is_observed && reader.has(name)) not_observed.push_back(name);
+    const bool is_measured = reader.measures(name);
+    if (is_observed) (is_measured ? outputs : not_in_log).push_back(name);
+    if (!is_observed && is_measured) not_observed.push_back(name);
   }
   if (outputs.empty()) return observed.empty() ? every : not_in_log;  // what reads them names what is missing
   if (!not_in_log.empty())

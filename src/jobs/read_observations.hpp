@@ -19,6 +19,11 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
 std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
                                                    const std::map<std::string, std::string>& columns);
 
+/// Columns of a log that are not the rates of what they should be over its time, whether or not a prior reads that: wrong_rates.
+/// @param columns  as checked
+std::vector<std::string> wrong_rates_of(const System& system, const Prior& prior, const CsvTable& log,
+                                        const std::map<std::string, std::string>& columns, double* unit = nullptr);
+
 /// As a fit found them: nothing of them is estimated any more.
 std::vector<Actuator> found(std::vector<Actuator> actuators);
 
@@ -77,12 +82,12 @@ class ActingStates {
   explicit ActingStates(const Prior& prior);
   /// Adds states of a system whose prior has the same latents.
   void count(const Prior& prior, const Eigen::MatrixXd& states, const Eigen::VectorXd& parameters);
-  /// Of each latent whose direction is 0 at all of them.
-  [[nodiscard]] std::vector<std::string> idle_texts() const;
+  /// Of each latent whose direction is 0 at all of them or, where `accelerations` are all that is measured, that of a constraint force.
+  [[nodiscard]] std::vector<std::string> idle_texts(bool accelerations = true) const;
 
  private:
   std::vector<std::string> names_;
-  std::vector<bool> acts_;
+  std::vector<bool> acts_, moves_;  // at some state; what moves acts
   Eigen::Index n_states_ = 0;
 };
 

@@ -18,24 +18,47 @@ constexpr double irrelevant = 0.01;
 
 bool hardly_matters(const Relevance& one) { return std::max(one.relevance, one.effect.value_or(one.relevance)) < irrelevant; }
 
+// A fit that stopped short of its tolerances.
+void convergence_advice(const FitReport& report, std::vector<Advice>& advice) {
+  constexpr double alike = 1e-3;
+  const auto n_alike =
+      std::ranges::count_if(report.restarts, [&](const RestartReport& one) { return one.objective < report.objective + alike; });
+  if (n_alike >= 2 && report.termination != FitReport::unsettled) {
+    advice.push_back({Level::note, fmt::format("The optimiser stopped short of its tolerances: {}.", report.termination),
+                      fmt::format("It does not matter: {} of {} restarts ended within {} of the best objective.", n_alike,
+                                  report.restarts.size(), alike)});
+    return;
+  }
+  const bool at_limit = report.termination.find("limit of iterations") != std::string::npos;
+  advice.push_back({Level::warning, fmt::format("The optimiser did not converge: {}.", report.termination),
+                    at_limit ? "Fit again with a larger `max_iterations`, or with `start` of this file to go on from here."
+                             : "Fit again with `start` of this file to go on from here, or with more `restarts`."});
+}
+
 void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
-  const bool never_ran = report.iterations == 0 && !report.converged;
-  if (never_ran) {
+  const auto n_restarts_that = [&](const auto& is_so) { return std::ranges::count_if(report.restarts, is_so); };
+  const bool ran = report.converged || report.iterations > 0 ||
+                   n_restarts_that([](const RestartReport& one) { return one.iterations > 0; }) > 0;
+  if (!ran) {
+    const bool was_stopped = report.termination == FitReport::interrupted;
     advice.push_back({Level::note, fmt::format("Nothing was optimised: {}.", report.termination),
-                      "All figures below are of the starting values. Leave out `max_iterations=0` to fit."});
-  } else if (!report.converged) {
-    advice.push_back({Level::warning, fmt::format("The optimiser did not converge: {}.", report.termination),
-                      "Fit again with a larger `max_iterations`, or with `start` of this file to go on from here."});
+                      fmt::format("All figures below are of the starting values. {}",
+                                  was_stopped ? "Fit again, without stopping it." : "Leave out `max_iterations=0` to fit.")});
+    return;
   }
-  if (never_ran) return;
-  int n_finite = 0, n_best = 0;
-  for (const RestartReport& restart : report.restarts) {
-    if (!std::isfinite(restart.objective)) continue;
-    ++n_finite;
-    // a unit of the objective is a factor e of the posterior density
-    if (restart.objective < report.objective + 1) ++n_best;
+  if (!report.converged) convergence_advice(report, advice);
+  const auto n_finite = n_restarts_that([](const RestartReport& one) { return std::isfinite(one.objective); });
+  // a unit of the objective is a factor e of the posterior density
+  const auto n_best = n_restarts_that([&](const RestartReport& one) { return one.objective < report.objective + 1; });
+  const auto n_not_begun =
+      n_restarts_that([](const RestartReport& one) { return one.evaluations == 0 && !std::isfinite(one.objective); });
+  const auto n_failed = std::ssize(report.restarts) - n_finite - n_not_begun;
+  if (n_not_begun > 0) {
+    advice.push_back(
+        {Level::note,
+         fmt::format("{} of {} restarts were not begun: the fit was stopped before.", n_not_begun, report.restarts.size()),
+         "One of them may have found a better optimum: fit again with `start` of this file."});
   }
-  const int n_failed = static_cast<int>(report.restarts.size()) - n_finite;
   if (n_failed > 0) {
     advice.push_back({Level::note, fmt::format("{} of {} restarts found no finite start.", n_failed, report.restarts.size()),
                       "Look at the bounds in the model file: a random start within them was no possible system."});
@@ -48,13 +71,22 @@ void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
   }
 }
 
+// Whether a lengthscale is that of a linear kernel, which only scales a slope.
+bool is_slope(const FitFile& fit, const Hyperparameter& h) {
+  if (!fit.model.system) return false;
+  const Kernel kernel = fit.prior().latents[static_cast<std::size_t>(h.owner)].kernel;
+  const std::string& name = kernel.parameters()[static_cast<std::size_t>(h.index)].name;
+  // a kernel that is linear alone does not stand in the names of its parameters
+  return name.starts_with("linear") || (name.starts_with("lengthscale") && kernel.text().find("linear") != std::string::npos);
+}
+
 // Hyperparameters at a bound of which the fit itself says nothing: not the system's, and no noise at its lower bound.
-void bound_advice(const FitReport& report, std::vector<Advice>& advice) {
+void bound_advice(const FitFile& fit, std::vector<Advice>& advice) {
   std::vector<std::string> short_lengthscales, others;
-  for (const Hyperparameter& h : report.hyperparameters) {
+  for (const Hyperparameter& h : fit.report.hyperparameters) {
     const bool is_lower = h.value - h.lower < h.upper - h.value;
     const bool is_lengthscale = h.kind == Hyperparameter::Kind::kernel && h.name.find("lengthscale") != std::string::npos;
-    if (!h.at_bound() || h.is_system_parameter()) continue;
+    if (!h.at_bound() || h.is_system_parameter() || (is_lengthscale && is_slope(fit, h))) continue;
     if (is_lengthscale && is_lower) {
       short_lengthscales.push_back(fmt::format("{} ({:.4g})", h.name, h.value));
     } else if (!(is_lengthscale || (h.kind == Hyperparameter::Kind::noise_stddev && is_lower))) {
@@ -69,8 +101,11 @@ void bound_advice(const FitReport& report, std::vector<Advice>& advice) {
                       "feature; a smaller bound makes it worse."});
   }
   if (!others.empty()) {
-    advice.push_back({Level::note, fmt::format("At a bound: {}.", fmt::join(others, ", ")),
-                      "Widen the bounds in the model file if you have no reason for them."});
+    advice.push_back(
+        {Level::note, fmt::format("At a bound: {}.", fmt::join(others, ", ")),
+         fit.prior_options.baseline
+             ? "The bounds of a baseline are fixed, in proportion to the spread of its data: it is there to compare with."
+             : "Widen the bounds in the model file if you have no reason for them."});
   }
 }
 
@@ -294,8 +329,9 @@ void test_advice(const Report& report, const ReportData& data, std::vector<Advic
 std::vector<Advice> learning_advice(const Report& report) {
   std::vector<Advice> advice;
   optimiser_advice(report.fit.report, advice);
-  bound_advice(report.fit.report, advice);
+  bound_advice(report.fit, advice);
   note_advice(report.notes, advice);
+  for (const ReportData& data : report.data) note_advice(data.notes, advice);
   constraint_advice(report, advice);
   rank_advice(report, advice);
   independence_advice(report, advice);

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <filesystem>
 #include <limits>
+#include <numeric>
 
 #include <fmt/chrono.h>
 #include <fmt/format.h>
@@ -21,6 +22,7 @@
 #include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 #include "jobs/rollout.hpp"
+#include "prior/code_function.hpp"
 #include "prior/load_function.hpp"
 
 namespace gp2 {
@@ -28,6 +30,7 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
+using Eigen::RowVectorXd;
 using Eigen::VectorXd;
 
 namespace {
@@ -118,8 +121,11 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
     data.is_of_other_system = elsewhere;
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
-    data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).reference_system(),
-                                           parameters_of(group.view(), posterior.values().parameters), data);
+    // the accelerations of windows are derived under the constraints
+    if (!group.has_sums()) {
+      data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).reference_system(),
+                                             parameters_of(group.view(), posterior.values().parameters), data);
+    }
     const Model& model = elsewhere ? *fit.systems[g] : fit.model;
     data.rollout =
         roll_out({&model, {}, group.view().other_system, prior_of(posterior.prior(), group.view())}, posterior, data.states, {});
@@ -214,10 +220,34 @@ VectorXd usual_state(const Prior& prior, const MatrixXd& states) {
   return states.col(nearest);
 }
 
-// What a latent is along its one direction that knows the load, as a friction coefficient: the force that was learned over the
-// direction under the mean load, on the coordinate where this is largest. Nothing where there is hardly a load.
-std::optional<LearnedForce> coefficient_of(const Posterior& posterior, const Latent& latent, const MatrixXd& states,
+// A view of what multiplies the one direction of a latent on forces: its force where this direction is 1 on the first coordinate and
+// those of other latents that read a load are 0. The load, which changes with it, has no part in it.
+View multiplier_of_direction(const Prior& prior, std::size_t of) {
+  OtherSystem plain{prior, std::vector<int>(prior.system->parameters().size())};
+  std::iota(plain.shared.begin(), plain.shared.end(), 0);
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    std::shared_ptr<const StateFunction>& directions = plain.prior.latents[a].directions;
+    if (a != of && !prior.latents[a].reads_multipliers()) continue;
+    const VectorXd constant = VectorXd::Unit(directions->size(), 0) * (a == of ? 1 : 0);
+    StateCode code;
+    code.evaluate = [constant](const StateCode::States& states, const StateCode::Parameters&) {
+      return MatrixXd(constant.replicate(1, states.cols()));
+    };
+    code.reads = std::vector<std::string>();
+    directions =
+        std::make_shared<CodeFunction>(std::move(code), "the direction of a coefficient", directions->size(), prior.system);
+  }
+  View view = View::learned_force(*prior.system);
+  view.rows = {0};
+  view.latent = static_cast<int>(of);
+  view.other_system = std::make_shared<const OtherSystem>(std::move(plain));
+  return view;
+}
+
+// What a latent is along its one direction that knows the load, as a friction coefficient. Nothing where there is hardly a load.
+std::optional<LearnedForce> coefficient_of(const Posterior& posterior, std::size_t of, const MatrixXd& states,
                                            const LearnedForce& force) {
+  const Latent& latent = posterior.prior().latents[of];
   const auto* const load = dynamic_cast<const LoadFunction*>(latent.directions.get());
   if (load == nullptr || latent.size() != 1 || latent.base != Latent::Base::force) return std::nullopt;
   const VectorXd& parameters = posterior.values().parameters;
@@ -241,8 +271,108 @@ std::optional<LearnedForce> coefficient_of(const Posterior& posterior, const Lat
   LearnedForce out = force;
   out.names = {"coefficient" + (force.names[0].find('@') == std::string::npos ? "" : "@" + latent.name)};
   out.at = force.at(loaded);
-  out.mean = force.mean(std::vector<Index>{row}, loaded).cwiseQuotient(direction(loaded).transpose());
-  out.stddev = force.stddev(std::vector<Index>{row}, loaded).cwiseQuotient(direction(loaded).transpose().cwiseAbs());
+  const Posterior::Marginal coefficient =
+      posterior.marginal(multiplier_of_direction(posterior.prior(), of), states(Eigen::all, loaded));
+  out.mean = coefficient.mean;
+  out.stddev = coefficient.stddev();
+  return out;
+}
+
+// The features of a latent, of which nothing was learned outside their ranges in the training data.
+class FeaturesOfData {
+ public:
+  FeaturesOfData(const Prior& prior, std::size_t latent, const MatrixXd& states)
+      : prior_(prior), latent_(latent), of_data_(evaluate_features(prior, latent, states)) {
+    constexpr double margin = 0.05;  // of the range: a curve may go a little beyond
+    const RowVectorXd low = of_data_.colwise().minCoeff(), high = of_data_.colwise().maxCoeff();
+    const RowVectorXd pad = margin * (high - low) + 1e-9 * low.cwiseAbs().cwiseMax(high.cwiseAbs());
+    low_ = low - pad, high_ = high + pad;
+  }
+
+  // Ends of the stretch about a state along its entry k, of those from `low` to `high`, on which all features stay within.
+  [[nodiscard]] std::pair<double, double> stretch(VectorXd state, Index k, double low, double high) const {
+    const double start = state[k];
+    const auto is_within = [&](double value) {
+      state[k] = value;
+      return holds(state);
+    };
+    const auto end = [&](double to) {
+      constexpr int n_steps = 100, n_halvings = 30;
+      double inside = start;
+      for (int i = 1; i <= n_steps; ++i) {
+        double outside = i == n_steps ? to : start + (to - start) * i / n_steps;
+        if (is_within(outside)) {
+          inside = outside;
+          continue;
+        }
+        for (int half = 0; half < n_halvings; ++half) {
+          const double middle = 0.5 * (inside + outside);
+          (is_within(middle) ? inside : outside) = middle;
+        }
+        break;
+      }
+      return inside;
+    };
+    return {end(low), end(high)};
+  }
+
+  // The one that changes from state to state, always to the same side; none where others change too.
+  [[nodiscard]] std::optional<Index> only_one_along(const MatrixXd& states, VectorXd& values) const {
+    const MatrixXd features = evaluate_features(prior_, latent_, states);
+    std::optional<Index> changing;
+    for (Index d = 0; d < features.cols(); ++d) {
+      if (!(features.col(d).maxCoeff() - features.col(d).minCoeff() > 1e-6 * (high_[d] - low_[d]))) continue;
+      if (changing) return std::nullopt;
+      changing = d;
+    }
+    if (!changing) return std::nullopt;
+    values = features.col(*changing);
+    const VectorXd steps = values.tail(values.size() - 1) - values.head(values.size() - 1);
+    if (!(steps.array() > 0).all() && !(steps.array() < 0).all()) return std::nullopt;
+    return changing;
+  }
+
+  [[nodiscard]] VectorXd of_data(Index feature) const { return of_data_.col(feature); }
+
+ private:
+  [[nodiscard]] bool holds(const VectorXd& state) const {
+    try {
+      const auto here = evaluate_features(prior_, latent_, state).row(0).array().eval();
+      return (here >= low_.array() && here <= high_.array()).all();
+    } catch (const InputError&) {  // where no data are a feature may have no value
+      return false;
+    }
+  }
+
+  const Prior& prior_;
+  std::size_t latent_;
+  MatrixXd of_data_;  // (N × D)
+  RowVectorXd low_, high_;
+};
+
+// States along one entry of a usual one, where the features of a latent stay within those of the data. Where that is a small part of
+// the entry's range, they are told by the one feature that changes there, if it is one.
+struct StatesAlong {
+  std::string along;
+  VectorXd at, data;
+  MatrixXd states;
+};
+std::optional<StatesAlong> states_along(const FeaturesOfData& features, const Latent& latent, const VectorXd& usual, Index k,
+                                        const std::string& entry, const VectorXd& data) {
+  constexpr Index n_points = 101;
+  constexpr double small_part = 0.2;
+  const auto [low, high] = features.stretch(usual, k, data.minCoeff(), data.maxCoeff());
+  StatesAlong out{entry, VectorXd::LinSpaced(n_points, low, high), data, usual.replicate(1, n_points)};
+  out.states.row(k) = out.at.transpose();
+  if (high - low >= small_part * (data.maxCoeff() - data.minCoeff())) return out;
+  const std::optional<Index> feature = features.only_one_along(out.states, out.at);
+  if (!feature) return std::nullopt;
+  out.along = latent.feature_names[static_cast<std::size_t>(*feature)];
+  out.data = features.of_data(*feature);
+  if (out.at[0] > out.at[n_points - 1]) {
+    out.at.reverseInPlace();
+    out.states = out.states.rowwise().reverse().eval();
+  }
   return out;
 }
 
@@ -279,8 +409,7 @@ MatrixXd own_states(const Posterior& posterior) {
 
 }  // namespace
 
-std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
-  constexpr Index n_points = 101;
+std::vector<LearnedForce> learned_forces(const Posterior& posterior, std::vector<std::string>* notes) {
   const Prior& prior = posterior.prior();
   const MatrixXd states = own_states(posterior);
   if (prior.reference || states.cols() == 0) return {};
@@ -296,19 +425,31 @@ std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
     const std::vector<std::string> whole_names = view.names(*prior.system);
     view.latent = latents_called(prior, latent.name, "latent");
     const std::vector<std::string> names = has_several ? view.names(*prior.system, latent.name) : whole_names;
+    const FeaturesOfData features(prior, a, states);
     std::vector<LearnedForce> of_latent, coefficients;
+    std::vector<std::string> left_out;
     for (std::size_t k = 0; k < entries.size(); ++k) {
       const auto row = states.row(static_cast<Index>(k));
       if (!latent.features->reads(static_cast<int>(k)) || !(row.maxCoeff() > row.minCoeff())) continue;
-      const VectorXd at = VectorXd::LinSpaced(n_points, row.minCoeff(), row.maxCoeff());
-      MatrixXd along = usual.replicate(1, n_points);
-      along.row(static_cast<Index>(k)) = at.transpose();
-      try {
-        const Posterior::Marginal marginal = posterior.marginal(view, along);
-        of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev(), row.transpose()});
-        if (auto one = coefficient_of(posterior, latent, along, of_latent.back())) coefficients.push_back(*std::move(one));
-      } catch (const InputError&) {  // where no data are a feature may have no value
+      const std::optional<StatesAlong> path =
+          states_along(features, latent, usual, static_cast<Index>(k), entries[k], row.transpose());
+      if (!path) {
+        left_out.push_back(entries[k]);
+        continue;
       }
+      const auto is_drawn = [&](const LearnedForce& one) { return one.along == path->along; };
+      if (std::ranges::any_of(of_latent, is_drawn)) continue;  // by another entry that the feature reads
+      try {
+        const Posterior::Marginal marginal = posterior.marginal(view, path->states);
+        of_latent.push_back({latent.name, path->along, names, path->at, marginal.mean, marginal.stddev(), path->data});
+        if (auto one = coefficient_of(posterior, a, path->states, of_latent.back())) coefficients.push_back(*std::move(one));
+      } catch (const InputError&) {  // where no data are a direction may have no value
+      }
+    }
+    if (notes != nullptr && !left_out.empty()) {
+      notes->push_back(
+          fmt::format("what '{}' has learned is not drawn along {}: moved alone, {} features of the latent away from the data",
+                      latent.name, fmt::join(left_out, ", "), left_out.size() == 1 ? "it takes" : "they take"));
     }
     move_largest(of_latent, all);
     move_largest(coefficients, all);
@@ -480,6 +621,7 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   constrained.system = request.system;
   const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
   const System& system = *at.model->system;
+  notes.insert(notes.end(), at.notes.begin(), at.notes.end());
   const std::vector<int> rows =
       acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, request.columns, notes), "`data`");
   const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
@@ -507,11 +649,31 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
       // not numbers: then it is not drawn
     }
   }
+  double unit_of_time = 1;
+  const std::vector<std::string> wrong =
+      wrong_rates_of(system, at.prior, table, checked_columns(*at.model, {&table}, request.columns), &unit_of_time);
+  for (const std::string& text : wrong) data.notes.push_back(fmt::format("warning: {}: {}", table.name(), text));
+  if (unit_of_time != 1) {
+    data.states.row(system.layout().t()) *= unit_of_time;
+    data.notes.push_back(
+        fmt::format("{}: the rates of the coordinates say that t counts {:g} s, not seconds: its motion is compared "
+                    "over t in seconds",
+                    table.name(), unit_of_time));
+  }
+  notes.insert(notes.end(), data.notes.begin(), data.notes.end());
   std::vector<std::string> episodes;
   if (const int column = reader.episode_column(); column >= 0) {
     for (int row = 0; row < table.n_rows(); ++row) episodes.push_back(table.cell(row, column));
   }
   data.rollout = roll_out(at, posterior, data.states, episodes);
+  // a motion that starts with a wrong velocity is another one
+  for (const Coordinate& one : system.coordinates()) {
+    const auto of_velocity =
+        std::ranges::find_if(wrong, [&](const std::string& text) { return text.starts_with(one.velocity() + " is not"); });
+    if (!data.rollout.reason.empty() || of_velocity == wrong.end()) continue;
+    data.rollout = {};
+    data.rollout.reason = *of_velocity;
+  }
   return data;
 }
 
@@ -544,7 +706,7 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   report.cross_validation = cross_validate(report.fit, posterior);
   report.notes = notes_of_fit(report.fit, posterior, report.cross_validation);
   report.relevance = relevance_of(posterior);
-  report.learned = learned_forces(posterior);
+  report.learned = learned_forces(posterior, &report.notes);
   if (request.data) {
     report.data.push_back(compare(report.fit, posterior, request, notes));
     add_learned_note(report.fit, *request.data, notes);

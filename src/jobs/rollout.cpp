@@ -26,7 +26,8 @@ namespace {
 struct RolloutLimits {
   static constexpr Index least_rows = 8, most_rows = 400;  // of the picture
   static constexpr int n_samples = 16;
-  static constexpr int most_steps = 3000;     // of one motion: a report is to take seconds
+  // of one motion, by one component of a mixture or by many: a report is to take seconds
+  static constexpr int most_steps = 3000, least_steps = 1000;
   static constexpr double longest_break = 5;  // usual steps, beyond which a log does not go on
   static constexpr double window = 30;        // of rms displacement / rms velocity: five oscillations of the slowest coordinate
   // of the measured range: below it is the noise of a start, above it what an eye sees
@@ -93,6 +94,14 @@ void unwrap(Eigen::Ref<Eigen::RowVectorXd, 0, Eigen::InnerStride<>> angles) {
   }
 }
 
+// A report lets nobody choose tolerances and the number of steps.
+std::string without_options(std::string why) {
+  const std::size_t advice = why.find("loosen the tolerances");
+  if (advice == std::string::npos) return why;
+  why.erase(why.find_last_of(":;", advice));
+  return why + "; gp2 simulate goes on";
+}
+
 // A motion at all times, NaN beyond what it reached; empty where it did not begin.
 struct Reached {
   MatrixXd states, multipliers;
@@ -116,7 +125,7 @@ Reached follow(SimulateJob job, std::size_t motion) {
   try {
     return reached(run_simulation(job).front(), "");
   } catch (const UnfinishedMotion& unfinished) {
-    return reached(unfinished.motions.front(), unfinished.what());
+    return reached(unfinished.motions.front(), without_options(unfinished.what()));
   }
 }
 
@@ -187,7 +196,7 @@ class Roll {
     SimulateRequest request;
     request.start = VectorXd(measured.col(0).head(2 * layout.nq));
     request.times = measured.row(layout.t()).transpose();
-    request.max_steps = std::max(RolloutLimits::most_steps / posterior_.n_components(), 200);
+    request.max_steps = std::max(RolloutLimits::most_steps / posterior_.n_components(), RolloutLimits::least_steps);
     request.n_samples = samples;
     SimulateJob job = prepare_simulation(asked_, posterior_, request);
     // states hold what acts, not what was commanded

@@ -297,8 +297,10 @@ std::string show(const FitFile& fit, const ShowRequest& request, const Spelling&
   const std::int64_t n_states = std::accumulate(n.begin(), n.end(), std::int64_t{0});
   if (!request.json) {
     const std::string said = notes.empty() ? "" : fmt::format("\nnotes\n  {}\n", fmt::join(notes, "\n  "));
-    return fmt::format("learned from {} states of {}\n{}{}\n{}", n_states, fit.data_source, text_of(fit.report, fit.model), said,
-                       of_model);
+    std::string found = text_of(fit.report, fit.model);
+    // what a fit said goes as soon as its rows change
+    if (!fit.notes) found.insert(found.find('\n'), ", at the fit; rows may have changed since");
+    return fmt::format("learned from {} states of {}\n{}{}\n{}", n_states, fit.data_source, found, said, of_model);
   }
   OrderedJson json = OrderedJson::parse(of_model), hyperparameters = OrderedJson::object();
   for (const Hyperparameter& h : fit.report.hyperparameters) hyperparameters[h.name] = h.value;

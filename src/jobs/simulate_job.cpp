@@ -310,6 +310,21 @@ MotionEnergy energy_with_learned(const Model& model, const VectorXd& parameters,
   return out;
 }
 
+/// Whether the prior's mean has a force that is not known to have a potential, at rest and without inputs.
+bool acts_at_rest(const Model& model, const Posterior& posterior, const VectorXd& parameters, const VectorXd& start) {
+  if (posterior.prior().mean != Prior::Mean::force || model.potential) return false;
+  constexpr Index enough = 100;
+  MatrixXd states = start;
+  const std::vector<Observations>& learned = posterior.observations();
+  if (!learned.empty() && learned.front().n_data() > 0)
+    states = learned.front().states().leftCols(std::min<Index>(enough, learned.front().states().cols()));
+  const StateLayout layout = model.system->layout();
+  states.middleRows(layout.nq, layout.nq).setZero();
+  states.bottomRows(layout.nu).setZero();
+  states.row(layout.t()) = states.row(layout.t()).array().isNaN().select(0, states.row(layout.t()));
+  return (model.system->evaluate(states, parameters).force.array().abs() > 0).any();
+}
+
 /// Mean and deviation of a mixture of equal weights (theory.md, T31).
 MotionEnergy mixed(const std::vector<MotionEnergy>& components) {
   if (components.size() == 1) return components.front();
@@ -334,13 +349,21 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
   };
   const VectorXd likeliest = parameters_of(posterior.values().parameters);
   SimulateJob job = prepare(model, system.actuators, likeliest, request);
+  job.notes.insert(job.notes.begin(), system.notes.begin(), system.notes.end());
   job.options.switching = switching_functions(model, /*of_latents=*/true);
   std::vector<int> potentials;
   for (int a = 0; a < static_cast<int>(posterior.prior().latents.size()); ++a) {
     if (posterior.prior().latents[static_cast<std::size_t>(a)].is_potential) potentials.push_back(a);
   }
   // learned potentials are functions of states of the fit's own system
-  const bool has_energy = potentials.empty() ? model.potential.has_value() : system.other_system == nullptr;
+  const bool lacks_potential = !potentials.empty() && acts_at_rest(model, posterior, likeliest, job.start);
+  if (lacks_potential) {
+    job.notes.push_back(
+        fmt::format("warning: no energy: {} has a learned potential, but the known force acts at rest and has no [mechanics] "
+                    "potential = \"…\"",
+                    model.name));
+  }
+  const bool has_energy = potentials.empty() ? model.potential.has_value() : system.other_system == nullptr && !lacks_potential;
   const auto energy_under = [&model, mean = posterior.prior().mean, potentials](const VectorXd& parameters,
                                                                                 const MatrixXd& states, const auto& learned) {
     return energy_with_learned(model, parameters, mean, potentials, states, [&](int a) { return learned(a, states); });

@@ -17,6 +17,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/fit_notes.hpp"
@@ -106,6 +107,23 @@ Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& 
 double left_out(const Posterior& posterior) {
   const std::shared_ptr<const InducingSummary> summary = posterior.component(0).summary();
   return summary ? 0.5 * summary->components.front().all.trace : 0;
+}
+
+// Why points that were chosen for other rows lose much of these.
+std::string reason_of_loss(const Posterior& posterior, const Observations& more) {
+  constexpr int fewest = 10;    // of fewer rows it takes too long to learn how far they are
+  constexpr double many = 0.1;  // of the rows
+  if (more.n_data() >= fewest) {
+    const VectorXd distance = posterior.distance_from_data(more.view(), more.states(), /*n_threads=*/0);
+    const auto n_far = static_cast<double>((distance.array() > Posterior::far_from_data).count());
+    if (n_far > many * more.n_data()) return "which lie far from those learned before";
+  }
+  constexpr double much_smaller = 0.5;
+  const VectorXd usual = more.usual_noise(more.noise().stddev());
+  const VectorXd before = measurement_noise(posterior, more.view().rows, 1, {});
+  if ((usual.array() < much_smaller * before.array()).any())
+    return "since their noise is much smaller than that of the fit, for which the points were chosen";
+  return "at states for which the points are too few";
 }
 
 // Noise that is given or stated must be usable, as that of a fit, whose accelerations tell how far they spread. Points that stand for
@@ -288,6 +306,65 @@ void extend_range(Posterior& posterior, FitFile& fit, const Observations& more) 
   set_prior(posterior, fit.prior());
 }
 
+// Of the accelerations those that a log measures at some row. Of a block of few rows one may be measured at none; the reader would take
+// that for a mistake.
+std::vector<std::string> measured_somewhere(std::vector<std::string> names, const LogReader& reader,
+                                            const UpdateRequest& request) {
+  const auto is_empty = [&](const std::string& column) {
+    const CsvTable& log = reader.table();
+    const int at = log.find(column);
+    for (int row = 0; at >= 0 && row < log.n_rows(); ++row) {
+      if (!log.is_empty(row, at)) return false;
+    }
+    return at >= 0;
+  };
+  std::erase_if(names, [&](const std::string& name) {
+    const bool lacks_stddevs = !request.noise_stddev && is_empty(reader.stddev_column(name));
+    return reader.has(name) && (!reader.measures(name) || lacks_stddevs);
+  });
+  return names;
+}
+
+// Rows of some of the names as rows of all: what is not among them is not measured.
+MatrixXd among(const std::vector<std::string>& all, const std::vector<std::string>& some, const MatrixXd& of_some, int n_rows) {
+  MatrixXd values = MatrixXd::Constant(std::ssize(all), n_rows, not_a_number);
+  for (Index k = 0; k < of_some.rows(); ++k) {
+    values.row(std::ranges::find(all, some[static_cast<std::size_t>(k)]) - all.begin()) = of_some.row(k);
+  }
+  return values;
+}
+
+void require_window(const Posterior& posterior, const UpdateRequest& request) {
+  if (!request.window) return;
+  if (*request.window < 1) throw InputError(fmt::format("`window`: must be positive, got {}", *request.window));
+  if (posterior.summary()) {
+    throw InputError(
+        "`window`: what was learned through inducing points cannot be taken away, since the observations themselves are not "
+        "kept; "
+        "`forget` discounts it");
+  }
+}
+
+// The newest n of the states of some groups.
+std::vector<Observations> newest_of(const std::vector<Observations>& groups, std::int64_t n) {
+  std::vector<Observations> newest;
+  for (auto group = groups.rbegin(); group != groups.rend() && n > 0; ++group) {
+    const auto n_here = static_cast<int>(std::min<std::int64_t>(n, group->n_data()));
+    const bool is_whole = n_here == group->n_data() || group->has_sums();  // which are not cut
+    newest.insert(newest.begin(), is_whole ? *group : group->slice(group->n_data() - n_here, n_here));
+    n -= n_here;
+  }
+  return newest;
+}
+
+// Whether one of the logs that the newest n states are of, by the rows of these, has the content of this one.
+bool has_among_newest(const FitFile& fit, const LogFile& log, std::int64_t n) {
+  for (auto known = fit.logs.rbegin(); known != fit.logs.rend() && n > 0; n -= (known++)->rows) {
+    if (known->checksum == log.checksum && known->bytes == log.bytes) return true;
+  }
+  return false;
+}
+
 }  // namespace
 
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
@@ -307,8 +384,15 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   view.rows = acceleration_rows(system, names, "`observe`");
   if (names.empty()) names = view.names(system);
   const bool projects = !fit.options.empty() && request_of(fit).problem.project;
-  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names, {},
+  const LogReader reader = open_log(fit.model, log, request.columns);
+  const std::vector<std::string> measured = measured_somewhere(names, reader, request);
+  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, measured, {},
                                    posterior.values().parameters, projects);
+  if (measured.size() < names.size()) {
+    read.accelerations = among(names, measured, read.accelerations, log.n_rows());
+    if (!stated_accelerations(names, reader).empty())
+      read.stated_stddev = among(names, measured, read.stated_stddev, log.n_rows());
+  }
 
   Noise noise = noise_of_more(fit, posterior, view, names, read, request, log, notes);
   notes.insert(notes.end(), read.notes.begin(), read.notes.end());
@@ -324,10 +408,12 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   Observations more{read.states(Eigen::all, rows), std::move(view), read.accelerations(Eigen::all, rows),
                     Noise(noise.stddev(), false, noise.scale())};
   require_usable_noise(posterior, more, log, rows, request.noise_stddev.has_value());
-  if (log.file() && fit.has_learned(*log.file())) {
+  // rows that the window leaves behind do not count twice
+  const std::int64_t n_left = request.window ? *request.window - more.n_data() : posterior.n_states();
+  if (log.file() && (request.window ? has_among_newest(fit, *log.file(), n_left) : fit.has_learned(*log.file()))) {
     notes.push_back(fmt::format("warning: {} is already in the fit: its rows count twice", log.name()));
   } else {
-    note_shared_rows(groups, {more}, notes);
+    note_shared_rows(request.window ? newest_of(groups, n_left) : groups, {more}, notes);
   }
   try {
     for (std::string& text : constraint_warnings(posterior, nullptr, log.name(), more.states(), more.view().rows, more.values(),
@@ -341,11 +427,53 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   return more;
 }
 
+void require_memory_of_more(const Posterior& posterior, const Observations& more, const std::string& log,
+                            const std::function<std::optional<double>()>& free, const std::function<bool(double, int)>& given) {
+  constexpr double number = sizeof(double), gigabyte = 1e9, share = 0.9, small = 1e8;
+  if (posterior.summary() || more.n_data() == 0) return;
+  const auto n_old = static_cast<double>(posterior.n_states()), n_more = static_cast<double>(more.n_data());
+  const double rank = n_old > 0 ? posterior.reduced_size() / n_old : static_cast<double>(more.view().size());
+  // a factor has room for some more rows; then it moves to twice that, of which the lower triangle is touched
+  struct Need {
+    double bytes, in_one_piece;
+  };
+  const auto need_of = [&](double old_rows, double more_rows) -> Need {
+    const double r_old = rank * old_rows, r_more = rank * more_rows, r = r_old + r_more;
+    const bool moves = r > r_old + std::max(64., r_old / 8);
+    const double factors = moves || posterior.n_components() > 1 ? posterior.n_components() * r * r / 2 : 0;
+    const double beside = r_old > 0 ? 2 * r_old * r_more + r_more * r_more : 0;
+    return {number * (factors + beside), moves ? number * std::pow(std::max(r, 1.7 * r_old), 2) : 0};
+  };
+  const Need need = need_of(n_old, n_more);
+  if (std::max(need.bytes, need.in_one_piece) <= small) return;
+  const std::optional<double> is_free = free();
+  const double usable = is_free ? std::max(share * *is_free, small) : std::numeric_limits<double>::infinity();
+  const auto fits = [&](const Need& one) { return one.bytes <= usable && (one.in_one_piece == 0 || given(one.in_one_piece, 1)); };
+  if (fits(need)) return;
+  // of the newest rows
+  int most = 0;
+  for (auto too_many = static_cast<int>(n_old + n_more); too_many - most > 1;) {
+    const int middle = most + (too_many - most) / 2;
+    const double new_rows = std::min<double>(middle, n_more);
+    (fits(need_of(middle - new_rows, new_rows)) ? most : too_many) = middle;
+  }
+  const std::string lack =
+      need.bytes > usable
+          ? fmt::format("{:.1f} GB more memory, of which {:.1f} GB are free", need.bytes / gigabyte, *is_free / gigabyte)
+          : fmt::format("{:.1f} GB more memory in one piece, which the system does not give", need.in_one_piece / gigabyte);
+  const std::string window =
+      most > 0 ? fmt::format("the newest {} rows would fit: keep these with `window={}`, or ", most, most) : "";
+  throw InputError(fmt::format("{}: an exact fit of {:.0f} rows takes {}; {}fit all logs, through inducing points", log,
+                               n_old + n_more, lack, window));
+}
+
 Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log,
                     std::vector<std::string>& notes) {
   const double before = left_out(posterior);
   const auto n_before = static_cast<double>(posterior.n_states());
   const int n_more = more.n_data(), n_draws = posterior.n_components();
+  require_memory_of_more(posterior, more, log.name(), [] { return free_memory(); });
+  const std::string reason = n_more > 0 && posterior.summary() ? reason_of_loss(posterior, more) : "";
   const FitPriorOptions before_range = fit.prior_options;
   if (n_more > 0) extend_range(posterior, fit, more);
   Posterior all = [&] {
@@ -367,9 +495,9 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   constexpr double much = 1, usual = 3;  // nats; times as much as of as many rows before
   if (of_more > much && of_more > usual * before * n_more / n_before) {
     notes.push_back(
-        fmt::format("warning: {}: the fit's inducing points lose about {:.2g} nats of its rows, which lie far from those learned "
-                    "before; a fit of all logs chooses points there too",
-                    log.name(), of_more));
+        fmt::format("warning: {}: the fit's inducing points lose about {:.2g} nats of its rows, {}; a fit of all logs chooses "
+                    "points for these too",
+                    log.name(), of_more, reason));
   }
   return all;
 }
@@ -391,9 +519,19 @@ Posterior remove_oldest(Posterior&& posterior, FitFile& fit, int n) {
   return left;
 }
 
-void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request) {
+void make_room(Posterior& posterior, FitFile& fit, Observations& more, const UpdateRequest& request) {
+  require_window(posterior, request);
   if (!request.window) return;
-  if (*request.window < 1) throw InputError(fmt::format("`window`: must be positive, got {}", *request.window));
+  if (more.n_data() > *request.window) more = more.slice(more.n_data() - *request.window, *request.window);
+  const std::int64_t n_old = posterior.n_states() + more.n_data() - *request.window;
+  if (n_old <= 0) return;
+  posterior = remove_oldest(std::move(posterior), fit, static_cast<int>(n_old));
+  fit.notes.reset();
+}
+
+void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request) {
+  require_window(posterior, request);
+  if (!request.window) return;
   const std::int64_t n_old = posterior.n_states() - *request.window;
   if (n_old > 0) {
     posterior = remove_oldest(std::move(posterior), fit, static_cast<int>(n_old));
@@ -411,10 +549,20 @@ void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& reques
 UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const UpdateRequest& request) {
   UpdateOutcome outcome;
   Posterior posterior = fit.posterior();
-  if (request.forget) posterior = forget(std::move(posterior), *request.forget);
+  require_window(posterior, request);
+  if (request.forget) {
+    posterior = forget(std::move(posterior), *request.forget);
+    fit.notes.reset();
+  }
+  UpdateRequest of_log = request;
   for (const CsvTable& log : logs) {
-    Observations more = more_observations(fit, posterior, log, request, outcome.notes);
+    if (of_log.window) *of_log.window -= log.n_rows();  // which come later
+  }
+  for (const CsvTable& log : logs) {
+    if (of_log.window) *of_log.window += log.n_rows();
+    Observations more = more_observations(fit, posterior, log, of_log, outcome.notes);
     outcome.n_added += more.n_data();
+    make_room(posterior, fit, more, request);
     posterior = with_more(std::move(posterior), fit, std::move(more), log, outcome.notes);
   }
   keep_newest(posterior, fit, request);

@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <mutex>
 #include <tuple>
 #include <utility>
@@ -28,36 +29,51 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 using Level = Finding::Level;
 
-std::vector<int> ranks_of(const System& system, const MechanicsBatch& mechanics) {
-  std::vector<int> ranks;
+std::vector<StateRank> ranks_of(const System& system, const MechanicsBatch& mechanics) {
+  std::vector<StateRank> ranks;
   for (const UdwadiaKalaba& projection : mechanics.projections) {
     const auto i = static_cast<int>(ranks.size());
-    int rank = projection.rank();
+    StateRank& one = ranks.emplace_back();
     for (int row = 0; row < system.nc(); ++row) {
-      if (system.is_conditional(row) && mechanics.values.A(i).row(row).isZero(0)) ++rank;
+      if (system.is_conditional(row) && mechanics.values.A(i).row(row).isZero(0)) one.inactive.push_back(row);
     }
-    ranks.push_back(rank);
+    one.rank = projection.rank() + static_cast<int>(one.inactive.size());
   }
   return ranks;
 }
 
-LowerRank states_of_lower_rank(const std::vector<int>& ranks) {
+LowerRank states_of_lower_rank(const std::vector<StateRank>& ranks) {
+  std::map<std::vector<int>, int> highest, usual;  // by the inactive rows
+  for (const StateRank& one : ranks) {
+    int& so_far = highest.try_emplace(one.inactive, one.rank).first->second;
+    so_far = std::max(so_far, one.rank);
+  }
+  // a row that is switched off counts as one more, and switched on as one more or, where it follows from others, as none
+  for (const auto& [inactive, rank] : highest) {
+    int& expected = usual.emplace(inactive, rank).first->second;
+    for (const auto& [fewer, of_fewer] : highest) {
+      if (std::ranges::includes(inactive, fewer)) expected = std::max(expected, of_fewer);
+    }
+  }
   LowerRank lower;
-  if (ranks.empty()) return lower;
-  const auto [lowest, highest] = std::minmax_element(ranks.begin(), ranks.end());
-  lower.lowest = *lowest;
-  lower.usual = *highest;
+  int largest_loss = -1;
   for (std::size_t i = 0; i < ranks.size(); ++i) {
-    if (ranks[i] < lower.usual) lower.states.push_back(static_cast<int>(i));
+    const int expected = usual.at(ranks[i].inactive), loss = expected - ranks[i].rank;
+    if (loss > 0) lower.states.push_back(static_cast<int>(i));
+    // where none is lost, what redundant rows leave
+    if (loss < largest_loss || (loss == largest_loss && expected >= lower.usual)) continue;
+    largest_loss = loss;
+    lower.usual = expected;
+    lower.lowest = ranks[i].rank;
   }
   return lower;
 }
 
 LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
   if (system.nc() == 0) return {};
-  std::vector<int> ranks(static_cast<std::size_t>(states.cols()));
+  std::vector<StateRank> ranks(static_cast<std::size_t>(states.cols()));
   const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
-    const std::vector<int> here = ranks_of(system, mechanics);
+    const std::vector<StateRank> here = ranks_of(system, mechanics);
     std::copy(here.begin(), here.end(), ranks.begin() + first);
   });
   return fault ? LowerRank{} : states_of_lower_rank(ranks);
@@ -165,10 +181,25 @@ MatrixXd even_force(const System& system, MatrixXd states, const Ref<const Vecto
   return (even.array().abs() > 1e-12 * (moving.array().abs() + back.array().abs())).select(even, 0);
 }
 
-// an M that changes with the motion comes with forces that are quadratic in the velocities
+// M as it were at one time: where time alone changes it there are no Coriolis forces.
+MatrixXd mass_at_time(const System& system, MatrixXd states, double t, const Ref<const VectorXd>& parameters) {
+  states.row(system.layout().t()).setConstant(t);
+  return system.evaluate(states, parameters).mass;
+}
+
+// an M that changes with the place comes with forces that are quadratic in the velocities
 void check_coriolis(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                     const MechanicsSummary& mechanics, std::vector<Finding>& findings) {
-  if (!(mechanics.largest_change > 1e-9 * mechanics.largest_entry)) return;
+  const double rounding = 1e-9 * mechanics.largest_entry;
+  if (!(mechanics.largest_change > rounding)) return;
+  const double t = states(system.layout().t(), 0);
+  const VectorXd first_mass = system.evaluate(states.leftCols(1), parameters).mass.col(0);
+  double largest_change = 0;
+  in_blocks(states, 1, [&](Index, const Ref<const MatrixXd>& block) {
+    const MatrixXd change = mass_at_time(system, block, t, parameters).colwise() - first_mass;
+    largest_change = std::max(largest_change, change.cwiseAbs().maxCoeff());
+  });
+  if (!(largest_change > rounding)) return;
   bool is_zero = true;
   in_blocks(states, 1, [&](Index, const Ref<const MatrixXd>& block) {
     is_zero = is_zero && even_force(system, block, parameters).isZero(0);
@@ -200,7 +231,7 @@ void report_mass(const System& system, const MechanicsSummary& mechanics, Index 
 }
 
 // the rank of A is the same at all states, and leaves some freedom
-void report_rank(const System& system, const std::vector<int>& ranks, const MechanicsSummary& mechanics,
+void report_rank(const System& system, const std::vector<StateRank>& ranks, const MechanicsSummary& mechanics,
                  std::vector<Finding>& findings) {
   const LowerRank lower = states_of_lower_rank(ranks);
   const int highest = lower.usual;
@@ -220,7 +251,7 @@ void report_rank(const System& system, const std::vector<int>& ranks, const Mech
   report_independence(mechanics, std::ssize(ranks), findings);
   int n_conditional = 0;
   for (int row = 0; row < system.nc(); ++row) n_conditional += system.is_conditional(row) ? 1 : 0;
-  if (highest - n_conditional >= system.nq()) {
+  if (std::ranges::max(ranks, {}, &StateRank::rank).rank - n_conditional >= system.nq()) {
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
   }
@@ -303,11 +334,11 @@ bool check_mechanics(const System& system, const Ref<const MatrixXd>& states, co
   const MatrixXd first_mass = system.evaluate(states.leftCols(1), parameters).M(0);
   MechanicsSummary mechanics;
   mechanics.lowest_rank_of_mass = system.nq();
-  std::vector<int> ranks(static_cast<std::size_t>(states.cols()));
+  std::vector<StateRank> ranks(static_cast<std::size_t>(states.cols()));
   MatrixXd sizes(system.nc(), states.cols());
   std::mutex mutex;
   const auto fault = for_each_mechanics(system, states, parameters, n_threads, [&](Index first, const MechanicsBatch& block) {
-    const std::vector<int> ranks_here = ranks_of(system, block);
+    const std::vector<StateRank> ranks_here = ranks_of(system, block);
     std::copy(ranks_here.begin(), ranks_here.end(), ranks.begin() + first);
     for (int i = 0; i < block.values.n_states(); ++i) {
       sizes.col(first + i) = block.values.A(i).rowwise().norm();

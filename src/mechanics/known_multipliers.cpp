@@ -20,7 +20,7 @@ void KnownMultipliers::compute(const Matrix& M, const Matrix& A, const Vector& b
   A_ = A;
   lambda_.setConstant(A.rows(), not_a_number);
   if (!M.allFinite() || !A.allFinite() || !b.allFinite() || !F.allFinite()) return;
-  projection_.compute(M, A, b);
+  projection_.compute(M, A, b, largest_rank_);
   if (!projection_.motion_is_determined()) return;
 
   a_bar_ = F;
@@ -92,6 +92,8 @@ std::string name_of(bool is_of_motion, int row) { return fmt::format("{}{})", is
 
 bool is_multiplier(std::string_view variable) { return variable.starts_with(known) || variable.starts_with(of_motion); }
 
+bool is_multiplier_of_motion(std::string_view multiplier) { return multiplier.starts_with(of_motion); }
+
 std::optional<std::string> row_fault(std::string_view multiplier, int nc) {
   for (int row = 0; row < nc; ++row) {
     if (multiplier == name_of(multiplier.starts_with(of_motion), row)) return std::nullopt;
@@ -99,20 +101,24 @@ std::optional<std::string> row_fault(std::string_view multiplier, int nc) {
   return fmt::format("{}: there is no such row of the constraints, of which there are {}", multiplier, nc);
 }
 
+std::optional<std::string> mixture_fault(std::string_view multiplier, std::string_view other) {
+  if (is_multiplier_of_motion(multiplier) == is_multiplier_of_motion(other)) return std::nullopt;
+  return "both lambda0 and lambda are read: write lambda for both, the multipliers of the motion itself";
+}
+
 Multipliers multipliers_in(std::span<const Expression> expressions, const System& system) {
-  bool reads_known = false;
-  Multipliers multipliers;
+  std::string first;
   for (const Expression& expression : expressions) {
     for (const std::string& variable : expression.graph().variables_of(expression)) {
       if (!is_multiplier(variable)) continue;
       if (const auto fault = row_fault(variable, system.nc())) throw InputError(*fault);
-      (variable.starts_with(known) ? reads_known : multipliers.are_of_motion) = true;
+      if (first.empty()) first = variable;
+      if (const auto fault = mixture_fault(first, variable)) throw InputError(*fault);
     }
   }
-  if (reads_known && multipliers.are_of_motion) {
-    throw InputError("both lambda0 and lambda are read: write lambda for both, the multipliers of the motion itself");
-  }
-  for (int row = 0; (reads_known || multipliers.are_of_motion) && row < system.nc(); ++row) {
+  Multipliers multipliers;
+  multipliers.are_of_motion = is_multiplier_of_motion(first);
+  for (int row = 0; !first.empty() && row < system.nc(); ++row) {
     multipliers.variables.push_back(expressions.front().graph().variable(name_of(multipliers.are_of_motion, row)));
   }
   return multipliers;
@@ -121,7 +127,7 @@ Multipliers multipliers_in(std::span<const Expression> expressions, const System
 MatrixXd with_known_multipliers(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
   MatrixXd out(states.rows() + system.nc(), states.cols());
   out.topRows(states.rows()) = states;
-  KnownMultipliers multipliers;
+  KnownMultipliers multipliers(system.largest_rank());
   SystemValues values;
   in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
     system.evaluate_into(block, parameters, values);

@@ -30,6 +30,8 @@ class KnownMultipliers {
   using Vector = Eigen::Ref<const Eigen::VectorXd>;
   using Quantity = StateEvaluator::Quantity;
 
+  explicit KnownMultipliers(int largest_rank) : largest_rank_(largest_rank) {}
+
   /// NaN where nothing determines the motion, or a number is not finite.
   void compute(const Matrix& M, const Matrix& A, const Vector& b, const Vector& F);
   [[nodiscard]] const Eigen::VectorXd& values() const { return lambda_; }  // λ₀ (nc)
@@ -40,6 +42,7 @@ class KnownMultipliers {
   [[nodiscard]] const Eigen::MatrixXd& derivatives();  // (nc × n)
 
  private:
+  int largest_rank_;  // of the system
   UdwadiaKalaba projection_;
   UdwadiaKalaba::Workspace workspace_;
   Eigen::MatrixXd M_, A_, K_, L_;
@@ -52,6 +55,12 @@ bool is_multiplier(std::string_view variable);
 
 /// What is wrong with reading such a one where there are nc rows.
 std::optional<std::string> row_fault(std::string_view multiplier, int nc);
+
+/// Whether it is λ.
+bool is_multiplier_of_motion(std::string_view multiplier);
+
+/// What is wrong with reading both of these multipliers in one function: it knows either λ₀ or λ.
+std::optional<std::string> mixture_fault(std::string_view multiplier, std::string_view other);
 
 /// The variables of every row, where an expression reads one of them; none elsewhere.
 struct Multipliers {

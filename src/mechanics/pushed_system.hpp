@@ -34,6 +34,7 @@ class PushedSystem final : public System {
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return system_->residual_labels(); }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override { return system_->reads(part); }
   [[nodiscard]] bool depends_on_parameter(int index) const override { return system_->depends_on_parameter(index); }
+  [[nodiscard]] int largest_rank() const override { return system_->largest_rank(); }
 
  private:
   std::shared_ptr<const System> system_;

@@ -191,7 +191,8 @@ void UdwadiaKalaba::complete_mass(const Ref<const MatrixXd>& M, const Ref<const 
   }
 }
 
-void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A, const Ref<const VectorXd>& b) {
+void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A, const Ref<const VectorXd>& b,
+                            int largest_rank) {
   const Index nq = M.rows();
   const Index nc = A.rows();
   rank_ = n_zero_rows_ = 0;
@@ -219,7 +220,7 @@ void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const Matrix
       A_unit_(k, i) *= scale;
     }
   }
-  decompose_rows();
+  decompose_rows(largest_rank);
   constexpr double well_conditioned = 1e-4;
   if (pivot < well_conditioned) {
     // T M⁻¹ rounds at ε κ^1.5 of T as it comes, κ = 1/pivot; with what A still sees of T taken away, at ε κ
@@ -236,15 +237,16 @@ void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const Matrix
     inconsistency_ = std::max(inconsistency_, std::abs(row_scale_[k] == 0 ? b[k] : residual_[k]));
     size_of_b_ = std::max(size_of_b_, std::abs(b_unit_[k]));
   }
+  if (rank_ == largest_rank && largest_rank < nc) inconsistency_ = 0;
 }
 
 // T and L from Bᵀ, of unit columns, in rows_
-void UdwadiaKalaba::decompose_rows() {
+void UdwadiaKalaba::decompose_rows(int largest_rank) {
   const Index nq = rows_.rows();
   const Index nc = rows_.cols();
   reflection_.resize(std::min(nq, nc));
   order_.resize(nc);
-  const Index rank = internal::pivoted_qr(rows_, reflection_, order_, rank_tolerance);
+  const Index rank = std::min<Index>(internal::pivoted_qr(rows_, reflection_, order_, rank_tolerance), largest_rank);
   rank_ = static_cast<int>(rank);
 
   // nothing constrains the motion: T = I to the bit, so that the force of constraints is 0 and not rounding that looks like news
@@ -525,7 +527,7 @@ double evaluate_each(const System& system, const Ref<const MatrixXd>& states, co
   double size_of_b = 0;
   for (int i = 0; i < n_states; ++i) {
     UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
-    projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i));
+    projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i), system.largest_rank());
     if (std::optional<std::string> text = fault_at(system, batch.values, states, i, projection)) {
       batch.fault = {i, std::move(*text)};
       break;

@@ -61,8 +61,12 @@ Model Model::parse(std::string text, std::string name, const RobotSource& robot,
   const auto not_toml = [&](const char* kind) {
     throw InputError(fmt::format("{}: not valid TOML but {}: a model file is wanted here", model.name, kind));
   };
-  const std::size_t first = model.text.find_first_not_of(" \t\r\n");
+  const std::size_t first = model.text.find_first_not_of(" \t\r\n\xEF\xBB\xBF");  // a byte order mark, too
   if (first != std::string::npos && model.text[first] == '{') not_toml("JSON, as gp2 fit writes it");
+  if (first != std::string::npos && model.text[first] == '<') {
+    throw InputError(fmt::format("{0}: not valid TOML but XML: name a robot's description in a model file, as robot = \"{1}\"",
+                                 model.name, std::filesystem::path(model.name).filename().string()));
+  }
   try {
     const internal::StepLimit limit;
     require_safe(model.text, model.name);

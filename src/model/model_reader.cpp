@@ -48,12 +48,23 @@ Expression ModelReader::expression_without(const TomlValue& value, const std::ve
   return e;
 }
 
-Expression ModelReader::expression_with_multipliers(const TomlValue& value, const char* rule) const {
+Expression ModelReader::expression_with_multipliers(const TomlValue& value, std::string& multiplier, const char* rule) const {
   const Expression e = expanded(value, symbols->ddq);
-  for (const std::string& multiplier : multipliers_of(e)) {
-    if (const auto fault = row_fault(multiplier, model.system->nc())) value.fail(*fault);
+  for (const std::string& read : multipliers_of(e)) {
+    if (const auto fault = row_fault(read, model.system->nc())) value.fail(*fault);
+    if (multiplier.empty()) multiplier = read;
+    if (const auto fault = mixture_fault(multiplier, read)) value.fail(*fault);
   }
   allow_only(value, e, symbols->ddq, rule);
+  return e;
+}
+
+Expression ModelReader::feature(const TomlValue& value) const {
+  std::string multiplier;
+  const Expression e = expression_with_multipliers(value, multiplier, "a feature may not depend on accelerations");
+  if (is_multiplier_of_motion(multiplier)) {
+    value.fail("lambda is what the latents make it, so that only directions and [truth] may read it; write lambda0");
+  }
   return e;
 }
 

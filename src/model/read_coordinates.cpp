@@ -42,6 +42,15 @@ void take_coordinates_of_robot(ModelReader& reader, const TomlValue& robot) {
   }
 }
 
+// Of each coordinate of the robot, whether it is the angle of a hinge.
+std::vector<bool> are_turns(const RobotDescription& robot) {
+  std::vector<bool> out;
+  for (const RobotDescription::Joint* joint : robot.joints()) {
+    out.insert(out.end(), joint->coordinates().size(), joint->type == RobotDescription::Joint::Type::hinge);
+  }
+  return out;
+}
+
 // "q1", or { name = "q1", angle = true }
 Coordinate read_coordinate(const TomlValue& entry) {
   if (!entry.is_table()) return {entry.text(), false};
@@ -88,6 +97,18 @@ void read_coordinates(ModelReader& reader) {
   if (of_robot.size() != reader.nq()) {
     coordinates->fail(fmt::format("{} names for the {} coordinates of the robot; they are, in this order: {}", reader.nq(),
                                   of_robot.size(), fmt::join(of_robot, ", ")));
+  }
+  const std::vector<TomlValue> entries = coordinates->array();
+  const std::vector<bool> turns = are_turns(*robot);
+  for (std::size_t j = 0; j < of_robot.size(); ++j) {
+    const Coordinate& own = reader.definition.coordinates[j];
+    if (own.name != of_robot[j] && std::ranges::count(of_robot, own.name) > 0) {
+      entries[j].fail(
+          fmt::format("the name of another coordinate of the robot, of which this one is '{}'; they are, in this order: {}",
+                      of_robot[j], fmt::join(of_robot, ", ")));
+    }
+    if (own.angle && !turns[j])
+      entries[j].fail(fmt::format("no angle: it is '{}' of the robot, which no hinge turns", of_robot[j]));
   }
 }
 

@@ -68,7 +68,7 @@ void read_features(const ModelReader& reader, const TomlValue& node, LatentSpec&
     latent.feature_code = code_of(reader, node, latent.name, &ModelCode::OfLatent::features);
   } else {
     for (const TomlValue& entry : node.array()) {
-      const Expression value = reader.expression_with_multipliers(entry, "a feature may not depend on accelerations");
+      const Expression value = reader.feature(entry);
       const std::string feature = ModelReader::text_of(entry, value);
       add(entry, feature, expand_angle(feature, reader.definition.coordinates));
     }
@@ -102,6 +102,7 @@ void read_directions(const ModelReader& reader, const TomlValue& node, LatentSpe
     return;
   }
   const std::vector<TomlValue> rows = reader.rows_per_coordinate(matrix);
+  std::string multiplier;
   for (const TomlValue& row : rows) {
     const std::vector<TomlValue> entries = row.array();
     if (entries.empty() || entries.size() != rows.front().array().size()) {
@@ -109,7 +110,8 @@ void read_directions(const ModelReader& reader, const TomlValue& node, LatentSpe
     }
     latent.directions.emplace_back();
     for (const TomlValue& entry : entries) {
-      const Expression value = reader.expression_with_multipliers(entry, "a direction may not depend on accelerations");
+      const Expression value =
+          reader.expression_with_multipliers(entry, multiplier, "a direction may not depend on accelerations");
       latent.directions.back().push_back(ModelReader::text_of(entry, value));
     }
   }
@@ -137,7 +139,7 @@ void require_potential(const ModelReader& reader, const TomlValue& entry, const 
   }
   if (features.is_array()) {
     for (const TomlValue& feature : features.array()) {
-      const Expression value = reader.expression_with_multipliers(feature, "a feature may not depend on accelerations");
+      const Expression value = reader.feature(feature);
       reader.refuse_multipliers(feature, value);
       reader.allow_only(feature, value, reader.of_motion(), "a potential depends on coordinates and t alone");
     }

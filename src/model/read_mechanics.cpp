@@ -128,7 +128,14 @@ void take_mechanics_of_robot(ModelReader& reader, const std::optional<TomlValue>
 const RobotQuantity& robot_quantity(const ModelReader& reader, const TomlValue& at, const std::string& name) {
   try {
     const Expression variable = reader.parsed(name);
-    if (variable.operation() == Operation::variable) return reader.robot()->quantity(variable.variable_name());
+    if (variable.operation() == Operation::variable) {
+      const std::string quantity = variable.variable_name();
+      if (quantity.starts_with('d') && quantity.find('(') != std::string::npos) {
+        throw InputError(
+            fmt::format("a force acts along {}, not along its derivative", quantity.substr(quantity.find_first_not_of('d'))));
+      }
+      return reader.robot()->quantity(quantity);
+    }
   } catch (const InputError& error) {
     at.fail(error.what());
   }
@@ -150,11 +157,12 @@ void read_mechanics(ModelReader& reader) {
   if (const auto coriolis = mechanics->get("coriolis"); coriolis && coriolis->boolean()) add_coriolis_force(reader);
 }
 
-std::vector<Expression> read_forces(const ModelReader& reader, const TomlValue& table, bool with_multipliers) {
+std::vector<Expression> read_forces(const ModelReader& reader, const TomlValue& table, std::string* multiplier) {
   RobotExpressions* const robot = reader.robot();
   const auto read = [&](const TomlValue& entry) {
-    return with_multipliers ? reader.expression_with_multipliers(entry, "a force may not depend on accelerations")
-                            : reader.expression_without(entry, reader.symbols->ddq, "a force may not depend on accelerations");
+    return multiplier != nullptr
+               ? reader.expression_with_multipliers(entry, *multiplier, "a force may not depend on accelerations")
+               : reader.expression_without(entry, reader.symbols->ddq, "a force may not depend on accelerations");
   };
   const std::size_t nq = reader.nq();
   std::vector<Expression> forces(nq, reader.definition.graph->constant(0));

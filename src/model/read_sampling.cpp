@@ -18,7 +18,8 @@ void read_truth(ModelReader& reader, const TomlValue& truth) {
   if (truth.n_entries() == 0) truth.fail("missing acceleration = [ … ] or force = [ … ]");
   Model& model = reader.model;
   model.truth.assign(reader.nq(), reader.definition.graph->constant(0));
-  model.truth_force = read_forces(reader, truth, true);
+  std::string multiplier;
+  model.truth_force = read_forces(reader, truth, &multiplier);
   const std::optional<TomlValue> acceleration = truth.get("acceleration");
   if (!acceleration) return;
   const std::vector<TomlValue> entries = acceleration->array();
@@ -26,7 +27,7 @@ void read_truth(ModelReader& reader, const TomlValue& truth) {
     acceleration->fail(fmt::format("expected {} entries, one per coordinate, got {}", reader.nq(), entries.size()));
   }
   for (std::size_t j = 0; j < entries.size(); ++j)
-    model.truth[j] = reader.expression_with_multipliers(entries[j], "the true acceleration may not depend on itself");
+    model.truth[j] = reader.expression_with_multipliers(entries[j], multiplier, "the true acceleration may not depend on itself");
 }
 
 namespace {

@@ -48,8 +48,11 @@ class ModelReader {
   /// @param rule  why none of `forbidden` may stand in it
   [[nodiscard]] Expression expression_without(const TomlValue& value, const std::vector<Expression>& forbidden,
                                               const char* rule) const;
-  /// Of the state, of parameters, and of the multipliers λ₀ and λ of the system, which is read already.
-  [[nodiscard]] Expression expression_with_multipliers(const TomlValue& value, const char* rule) const;
+  /// Of the state, of parameters, and of the multipliers of the system, which is read already: of λ₀ or of λ, but not of both.
+  /// @param multiplier  the first that the function read, of which this is an entry; empty: none yet
+  [[nodiscard]] Expression expression_with_multipliers(const TomlValue& value, std::string& multiplier, const char* rule) const;
+  /// Of the state, of parameters and of λ₀.
+  [[nodiscard]] Expression feature(const TomlValue& value) const;
   /// The points of the robot are left as they are.
   [[nodiscard]] Expression unexpanded(const TomlValue& value, const std::vector<Expression>& forbidden = {}) const;
   [[nodiscard]] Expression parsed(const TomlValue& value, const std::vector<Expression>& forbidden,
@@ -104,8 +107,8 @@ void read_potential(ModelReader& reader);
 
 /// force = [ … ], one per coordinate, with a robot one per axis of its joints, and force_on = { 'site("tip").x' = … }: a force
 /// along a quantity r acts on the coordinates as (∂r/∂q)ᵀ force.
-/// @param with_multipliers  whether λ₀ and λ may stand there
-std::vector<Expression> read_forces(const ModelReader& reader, const TomlValue& table, bool with_multipliers = false);
+/// @param multiplier  as for expression_with_multipliers; null: none may stand there
+std::vector<Expression> read_forces(const ModelReader& reader, const TomlValue& table, std::string* multiplier = nullptr);
 
 /// Positions of entries, each after those whose names it uses; complains of a circle.
 /// @param words  of each entry

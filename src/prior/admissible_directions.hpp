@@ -21,6 +21,8 @@ class AdmissibleDirections {
  public:
   using Matrix = Eigen::Ref<const Eigen::MatrixXd>;
 
+  explicit AdmissibleDirections(int largest_rank) : largest_rank_(largest_rank) {}
+
   /// @param A  (nc × nq)
   /// @param B  diagonal (nq × nq), positive
   /// @returns E (nq × nq), NaN where B is not finite
@@ -33,7 +35,7 @@ class AdmissibleDirections {
       return E_;
     }
     mass_ = stddev_.cwiseAbs2().cwiseInverse().asDiagonal();
-    projection_.compute(mass_, A, b_);
+    projection_.compute(mass_, A, b_, largest_rank_);
     if (!projection_.motion_is_determined()) {
       throw NumericalError(fmt::format(
           "directions that the constraints leave: deviations from {:.3g} to {:.3g} have no squares to compute with in "
@@ -66,6 +68,7 @@ class AdmissibleDirections {
   }
 
  private:
+  int largest_rank_;  // of the system
   Eigen::VectorXd stddev_, b_;
   Eigen::MatrixXd mass_, E_, L_;
   Eigen::VectorXd Ef_, scaled_, multipliers_;

@@ -54,7 +54,7 @@ MatrixXd LoadFunction::differentiate(const States& states, const Parameters& par
   x.topRows(n_state) = states;
   MatrixXd through_lambda0 = MatrixXd::Zero(size(), states.cols());
   VectorXd slopes(std::ssize(entries));
-  KnownMultipliers lambda0;
+  KnownMultipliers lambda0(system_->largest_rank());
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     lambda0.compute(values.M(i), values.A(i), values.b(i), values.F(i));
     lambda0.start_derivatives(1);
@@ -84,6 +84,7 @@ class LoadFunction::ChainEvaluator final : public Evaluator {
         function_(of.function_->make_evaluator(parameters)),
         system_(of.system_->make_evaluator(parameters_of(*of.system_, parameters), false)),
         system_and_derivatives_(of.system_->make_evaluator(parameters_of(*of.system_, parameters), true)),
+        lambda0_(of.system_->largest_rank()),
         x_(n_state_ + of.system_->nc()),
         slopes_(std::ssize(function_->entries())) {
     MatrixXi depends = MatrixXi::Zero(of.size(), n_state_);

@@ -161,7 +161,7 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
         block(E, i, nq) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(E, i, nq));
       }
     } else if (latent.base == Latent::Base::admissible) {
-      AdmissibleDirections directions;
+      AdmissibleDirections directions(prior.system->largest_rank());
       for (int i = 0; i < n_states; ++i) block(E, i, nq) = directions.compute(mechanics.values.A(i), block(E, i, nq));
     }
     values.directions.push_back(std::move(E));
@@ -201,7 +201,7 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));
     } else if (latent.base == Latent::Base::admissible) {
       MatrixXd all = evaluate_base(latent, states, parameters, nq, nullptr);
-      AdmissibleDirections directions;
+      AdmissibleDirections directions(prior.system->largest_rank());
       for (int i = 0; i < n_states; ++i) {
         directions.compute(mechanics.values.A(i), block(all, i, nq));
         block(dE, i, nq) = directions.differentiate(derivative.A(i));

@@ -41,16 +41,18 @@ std::vector<std::string> distinct(std::vector<std::string> names) {
 }
 
 // Keeps what has the name that is asked for.
+// @param left_out  why some are not among them
 void keep(std::vector<LearnedCurve>& curves, const char* option, const std::optional<std::string>& given,
-          const std::function<std::string(const LearnedCurve&)>& name_of) {
+          const std::function<std::string(const LearnedCurve&)>& name_of, const std::vector<std::string>& left_out = {}) {
   if (!given) return;
   std::vector<std::string> known;
   for (const LearnedCurve& one : curves) known.push_back(name_of(one));
   std::erase_if(curves, [&](const LearnedCurve& one) { return name_of(one) != *given; });
   if (!curves.empty()) return;
   known = distinct(std::move(known));
-  throw InputError(fmt::format("{}: '{}' is not among what was learned{}; there are: {}", option, *given,
-                               suggestion(*given, known), fmt::join(known, ", ")));
+  throw InputError(fmt::format("{}: '{}' is not among what was learned{}; there are: {}{}{}", option, *given,
+                               suggestion(*given, known), fmt::join(known, ", "), left_out.empty() ? "" : "; ",
+                               fmt::join(left_out, "; ")));
 }
 
 // Round numbers within a range, about n of them.
@@ -107,7 +109,8 @@ std::vector<Option> options(PlotRequest& request) {
   return {
       {"what", &request.what, "LATENT", "latent whose force is plotted", "the force that the data determine best"},
       {"along", &request.along, "NAME",
-       "state variable on the horizontal axis; all others have their values in the most typical row of the training data",
+       "state variable, or feature of several of them, on the horizontal axis; all others have their values in the most typical "
+       "row of the training data",
        "the variable along which the force changes most"},
       {"force", &request.force, "COORDINATE",
        "coordinate on which the force acts; `force=coefficient` plots the coefficient of load-dependent friction",
@@ -118,7 +121,8 @@ std::vector<Option> options(PlotRequest& request) {
 LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& request) {
   if (posterior.prior().reference) throw InputError("nothing to plot: a baseline learns accelerations, not forces");
   std::vector<LearnedCurve> curves;
-  for (const LearnedForce& one : learned_forces(posterior)) {
+  std::vector<std::string> left_out;
+  for (const LearnedForce& one : learned_forces(posterior, &left_out)) {
     const double largest = one.mean.cwiseAbs().maxCoeff() + one.stddev.maxCoeff();
     for (Index row = 0; row < one.mean.rows(); ++row) {
       // coordinates that the latent does not act on are left out
@@ -126,6 +130,7 @@ LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& reques
       if (size > 1e-12 * largest) curves.push_back({one, row});
     }
   }
+  if (curves.empty() && !left_out.empty()) throw InputError(fmt::format("nothing to plot: {}", fmt::join(left_out, "; ")));
   if (curves.empty()) {
     throw InputError(
         "nothing to plot: no latent of the fit depends on a variable that changes in the training data of its own system");
@@ -133,7 +138,8 @@ LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& reques
   keep(curves, "`what`", request.what, [](const LearnedCurve& one) { return one.force.latent; });
   keep(curves, "`force`", request.force,
        [](const LearnedCurve& one) { return coordinate_of(one.force.names[static_cast<std::size_t>(one.row)]); });
-  keep(curves, "`along`", request.along, [](const LearnedCurve& one) { return one.force.along; });
+  keep(
+      curves, "`along`", request.along, [](const LearnedCurve& one) { return one.force.along; }, left_out);
   // a coefficient says what was learned, the force what it is under one load
   return *std::ranges::max_element(curves, {}, [](const LearnedCurve& one) {
     return std::pair(one.force.names[static_cast<std::size_t>(one.row)].starts_with("coefficient"),

@@ -91,6 +91,7 @@ Json model_json(const FitFile& fit) {
       A.push_back(row.A);
       b.push_back({row.b});
       constraints.push_back({{"text", row.text}, {"level", word_of(row.level)}});
+      if (!row.condition.empty()) constraints.back().update({{"when", row.condition}, {"contact", row.contact.has_value()}});
     }
   } else {
     for (const std::string& label : system.constraint_labels())
@@ -192,7 +193,7 @@ Json hyperparameters_json(const FitReport& report, const Model& model) {
   return rows;
 }
 
-Json fit_json(const FitReport& report) {
+Json fit_json(const FitReport& report, bool rows_are_those_of_fit) {
   Json restarts = Json::array();
   for (const RestartReport& one : report.restarts) {
     restarts.push_back({{"objective", one.objective},
@@ -211,6 +212,7 @@ Json fit_json(const FitReport& report) {
              {"effective_size", report.draws->effective_size.minCoeff()}};
   }
   return {{"draws", draws},
+          {"rows_are_those_of_fit", rows_are_those_of_fit},
           {"nll", report.negative_log_likelihood},
           {"objective", report.objective},
           {"converged", report.converged},
@@ -400,7 +402,8 @@ Json page_json(const Report& report, const Spelling& spelled) {
                {"observations", observations_json(report.fit)},
                {"parameters", parameters_json(report.fit)},
                {"hyperparameters", hyperparameters_json(report.fit.report, report.fit.model)},
-               {"fit", fit_json(report.fit.report)},
+               // what a fit said goes as soon as its rows change
+               {"fit", fit_json(report.fit.report, report.fit.notes.has_value())},
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
                {"advice", advice_json(learning_advice(report), spelled)},
                {"relevance", relevance_json(report.relevance)},

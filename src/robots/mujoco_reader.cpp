@@ -95,10 +95,14 @@ std::string mend_of(const std::string& refusal) {
       "Where it is no slip of the pen, the file is for another version of MuJoCo: build gp2 with that one (GP2_MUJOCO_DIR)";
   for (const Mend& known :
        {Mend{"larger than mjMINVAL", "A body that moves needs a mass and an inertia: give it <inertial> or a geom"},
-        Mend{"A + B >= C", "No rigid body has such an inertia: correct it"}, Mend{"Could not open", missing},
-        Mend{"could not open", missing}, Mend{"Error opening file", missing}, Mend{"failed to open file", missing},
-        Mend{"but not `limited`", "From 3.0 on MuJoCo does the first of these by itself"}, Mend{"unrecognized attribute", newer},
-        Mend{"unrecognized element", newer}, Mend{"invalid keyword", newer}, Mend{"too much data", newer}}) {
+        Mend{"A + B >= C", "No rigid body has such an inertia: correct it"},
+        Mend{"free joint can only be used on top level",
+             "A body that moves freely hangs on the world: in URDF name the parent link of its floating joint world, in MJCF "
+             "put it straight into <worldbody>"},
+        Mend{"Could not open", missing}, Mend{"could not open", missing}, Mend{"Error opening file", missing},
+        Mend{"failed to open file", missing}, Mend{"but not `limited`", "From 3.0 on MuJoCo does the first of these by itself"},
+        Mend{"unrecognized attribute", newer}, Mend{"unrecognized element", newer}, Mend{"invalid keyword", newer},
+        Mend{"too much data", newer}}) {
     if (refusal.find(known.words) != std::string::npos) return fmt::format(". {}", known.mend);
   }
   return "";

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <array>
 #include <cctype>
+#include <charconv>
+#include <initializer_list>
 #include <iterator>
 #include <locale>
 #include <map>
@@ -73,11 +75,7 @@ class Urdf {
     for (const auto& [tag, element] : robot_) {
       if (tag == "joint") check_joint(element, xml.mimics);
     }
-    for (const RobotXml::Mimic& mimic : xml.mimics) {
-      if (joints_.count(mimic.followed) == 0) {
-        fail(fmt::format("joint '{}': it mimics '{}', which is no joint of the file", mimic.joint, mimic.followed));
-      }
-    }
+    for (const RobotXml::Mimic& mimic : xml.mimics) check_mimic(mimic);
     check_tree();
     keep_fixed_links();
     return xml;
@@ -90,6 +88,46 @@ class Urdf {
     const auto name = attribute(element, "name");
     if (!name || name->empty()) fail(fmt::format("a <{}> has no name", tag));
     return *name;
+  }
+
+  // The element of this tag; null: there is none.
+  [[nodiscard]] const Tree* only(const Tree& parent, const char* tag, const std::string& where) const {
+    if (parent.count(tag) > 1) fail(fmt::format("{}: its <{}> stands twice: remove one", where, tag));
+    const auto found = parent.find(tag);
+    return found == parent.not_found() ? nullptr : &found->second;
+  }
+
+  static bool is_number(std::string_view word) {
+    if (word.starts_with('+')) word.remove_prefix(1);
+    const char* const end = word.data() + word.size();
+    double value = 0;
+    const auto [stop, error] = std::from_chars(word.data(), end, value);
+    return stop == end && error != std::errc::invalid_argument;
+  }
+
+  // An attribute of so many numbers. MuJoCo refuses others too, but does not say of which link or joint they are.
+  struct Numbers {
+    const char *tag, *name;
+    std::size_t n;
+    bool is_required;  // where the element is there
+  };
+
+  void check_numbers(const Tree& parent, std::initializer_list<Numbers> all, const std::string& where) const {
+    for (const auto& [tag, name, n, is_required] : all) {
+      const Tree* const element = only(parent, tag, where);
+      const auto text = element != nullptr ? attribute(*element, name) : std::nullopt;
+      if (element != nullptr && !text && is_required) fail(fmt::format("{}: its <{}> has no {}", where, tag, name));
+      if (!text) continue;
+      std::istringstream stream(*text);
+      const std::vector<std::string> words{std::istream_iterator<std::string>(stream), {}};
+      if (words.size() == n && std::all_of(words.begin(), words.end(), is_number)) continue;
+      fail(fmt::format("{}: {} of its <{}> must be {}, got '{}'", where, name, tag,
+                       n == 1 ? "a number" : fmt::format("{} numbers with spaces between", n), *text));
+    }
+  }
+
+  void check_origin(const Tree& parent, const std::string& where) const {
+    check_numbers(parent, {{"origin", "xyz", 3, false}, {"origin", "rpy", 3, false}}, where);
   }
 
   [[nodiscard]] double number(const std::optional<std::string>& text, const std::string& where, const char* what) const {
@@ -105,22 +143,47 @@ class Urdf {
   void check_link(Tree& link) {
     const std::string where = fmt::format("link '{}'", name_of(link, "link"));
     if (!links_.insert(name_of(link, "link")).second) fail(fmt::format("{}: it stands twice", where));
-    const auto inertial = link.get_child_optional("inertial");
-    if (!inertial) return;
-    const auto mass = inertial->get_child_optional("mass");
-    if (!mass) fail(fmt::format("{}: its <inertial> has no <mass>", where));
-    const double value = number(attribute(*mass, "value"), where, "its mass");
-    if (!(value >= 0)) fail(fmt::format("{}: its mass must be ≥ 0 kg, got {}", where, value));
+    const Tree* const inertial = only(link, "inertial", where);
+    if (inertial != nullptr) check_inertial(*inertial, where);
 
     // shapes only matter where they stand in for an inertia
-    if (inertia_is_of_shapes_) return;
-    link.erase("visual");
-    link.erase("collision");
+    if (inertial != nullptr && !inertia_is_of_shapes_) {
+      link.erase("visual");
+      link.erase("collision");
+    }
+    for (const auto& [tag, element] : link) {
+      if (tag == "collision") check_shape(element, fmt::format("{}, <collision>", where));
+    }
+  }
+
+  void check_inertial(const Tree& inertial, const std::string& where) const {
+    const std::string within = fmt::format("{}, <inertial>", where);
+    const Tree* const mass = only(inertial, "mass", within);
+    if (mass == nullptr) fail(fmt::format("{}: its <inertial> has no <mass>", where));
+    const double value = number(attribute(*mass, "value"), where, "its mass");
+    if (!(value >= 0)) fail(fmt::format("{}: its mass must be ≥ 0 kg, got {}", where, value));
+    if (only(inertial, "inertia", within) == nullptr) fail(fmt::format("{}: its <inertial> has no <inertia>", where));
+    for (const char* entry : {"ixx", "iyy", "izz", "ixy", "ixz", "iyz"}) {
+      check_numbers(inertial, {{"inertia", entry, 1, true}}, within);
+    }
+    check_origin(inertial, within);
+  }
+
+  void check_shape(const Tree& shape, const std::string& where) const {
+    check_origin(shape, where);
+    const Tree* const geometry = only(shape, "geometry", where);
+    if (geometry == nullptr) fail(fmt::format("{}: it has no <geometry>", where));
+    check_numbers(*geometry,
+                  {{"box", "size", 3, true},
+                   {"sphere", "radius", 1, true},
+                   {"cylinder", "radius", 1, true},
+                   {"cylinder", "length", 1, true}},
+                  where);
   }
 
   [[nodiscard]] std::string link_of(const Tree& joint, const char* end, const std::string& where) const {
-    const auto child = joint.get_child_optional(end);
-    const auto link = child ? attribute(*child, "link") : std::nullopt;
+    const Tree* const child = only(joint, end, where);
+    const auto link = child != nullptr ? attribute(*child, "link") : std::nullopt;
     if (!link) fail(fmt::format("{}: it has no <{} link=\"…\"/>", where, end));
     if (links_.count(*link) == 0) {
       fail(fmt::format("{}: its {} link '{}' is not in the file; add <link name=\"{}\"> or correct the name", where, end, *link,
@@ -133,8 +196,8 @@ class Urdf {
     static constexpr std::array<const char*, 6> types = {"revolute", "continuous", "prismatic", "fixed", "floating", "planar"};
     const std::string name = name_of(joint, "joint");
     const std::string where = fmt::format("joint '{}'", name);
-    if (!joints_.insert(name).second) fail(fmt::format("{}: it stands twice", where));
     const std::string type = attribute(joint, "type").value_or("");
+    if (!types_.emplace(name, type).second) fail(fmt::format("{}: it stands twice", where));
     if (std::find(types.begin(), types.end(), type) == types.end()) {
       fail(fmt::format("{}: its type is '{}'; there is: {}", where, type, fmt::join(types, ", ")));
     }
@@ -143,12 +206,37 @@ class Urdf {
     if (!parents_.emplace(child, parent).second) {
       fail(fmt::format("link '{}': it is the child of two joints; a loop is closed in MJCF, with <equality><connect>", child));
     }
-    if (const auto mimic = joint.get_child_optional("mimic")) {
+    check_origin(joint, where);
+    check_numbers(joint, {{"axis", "xyz", 3, true}}, where);
+    // MuJoCo does not read these of a joint that cannot move
+    if (type != "fixed") {
+      for (const char* limit : {"lower", "upper", "effort"}) {
+        check_numbers(joint, {{"limit", limit, 1, false}}, where);
+      }
+      check_numbers(joint, {{"dynamics", "damping", 1, false}, {"dynamics", "friction", 1, false}}, where);
+    }
+    if (const Tree* const mimic = only(joint, "mimic", where)) {
       const auto followed = attribute(*mimic, "joint");
       if (!followed) fail(fmt::format("{}: its <mimic> names no joint", where));
       const double multiplier = number(attribute(*mimic, "multiplier").value_or("1"), where, "the multiplier of its <mimic>");
       const double offset = number(attribute(*mimic, "offset").value_or("0"), where, "the offset of its <mimic>");
       mimics.push_back({name, *followed, multiplier, offset});
+    }
+  }
+
+  void check_mimic(const RobotXml::Mimic& mimic) const {
+    const auto& [joint, followed, multiplier, offset] = mimic;
+    if (types_.count(followed) == 0) {
+      fail(fmt::format("joint '{}': it mimics '{}', which is no joint of the file", joint, followed));
+    }
+    if (joint == followed) fail(fmt::format("joint '{}': it mimics itself; name another joint or remove the <mimic>", joint));
+    for (const std::string& either : {joint, followed}) {
+      const std::string& type = types_.at(either);
+      if (type != "fixed" && type != "floating" && type != "planar") continue;
+      fail(
+          fmt::format("joint '{}': it mimics '{}', but the type of '{}' is {}: only revolute, continuous and prismatic joints "
+                      "mimic or are mimicked",
+                      joint, followed, either, type));
     }
   }
 
@@ -186,7 +274,7 @@ class Urdf {
   std::string name_;
   bool inertia_is_of_shapes_ = false;  // for a link that has its own, too
   std::set<std::string> links_;
-  std::set<std::string> joints_;
+  std::map<std::string, std::string> types_;    // of a joint by its name
   std::map<std::string, std::string> parents_;  // of a link by its name
 };
 

@@ -37,30 +37,38 @@ struct Linearisation {
 /// Equations r(x) = 0 in coordinates, or in velocities.
 struct Equations {
   std::vector<std::string> texts;  // one per equation
+  std::vector<bool> come_and_go;   // whether it holds under a condition alone
   std::vector<int> variables;      // the coordinates, or velocities, that the equations depend on: entries of the state
   std::function<Linearisation(const MatrixXd& state, const VectorXd& parameters)> linearise;
+};
+
+/// An equation given by an expression.
+struct WrittenEquation {
+  Expression residual;
+  std::string text;
+  bool comes_and_goes = false;
 };
 
 /// Equations given by expressions.
 /// @param candidates   the coordinates, or the velocities, in the order of the state
 /// @param first_index  of the candidates in the state
-Equations equations_of(const std::vector<std::pair<Expression, std::string>>& residuals,
-                       const std::vector<Expression>& candidates, int first_index, const std::vector<Expression>& tape_inputs,
-                       ExpressionGraph& graph) {
+Equations equations_of(const std::vector<WrittenEquation>& equations, const std::vector<Expression>& candidates, int first_index,
+                       const std::vector<Expression>& tape_inputs, ExpressionGraph& graph) {
   Equations out;
   std::vector<Expression> outputs;
-  for (const auto& [residual, text] : residuals) {
-    outputs.push_back(residual);
-    out.texts.push_back(text);
+  for (const WrittenEquation& equation : equations) {
+    outputs.push_back(equation.residual);
+    out.texts.push_back(equation.text);
+    out.come_and_go.push_back(equation.comes_and_goes);
   }
   for (std::size_t j = 0; j < candidates.size(); ++j) {
-    const bool decided = std::any_of(residuals.begin(), residuals.end(),
-                                     [&](const auto& residual) { return graph.depends_on(residual.first, candidates[j]); });
+    const bool decided = std::any_of(equations.begin(), equations.end(),
+                                     [&](const auto& equation) { return graph.depends_on(equation.residual, candidates[j]); });
     if (!decided) continue;
-    for (const auto& [residual, text] : residuals) outputs.push_back(graph.differentiate(residual, candidates[j]));
+    for (const auto& equation : equations) outputs.push_back(graph.differentiate(equation.residual, candidates[j]));
     out.variables.push_back(first_index + static_cast<int>(j));
   }
-  const auto n_equations = static_cast<Index>(residuals.size()), n_variables = static_cast<Index>(out.variables.size());
+  const auto n_equations = static_cast<Index>(equations.size()), n_variables = static_cast<Index>(out.variables.size());
   out.linearise = [tape = Tape(outputs, tape_inputs), n_equations, n_variables](const MatrixXd& state,
                                                                                 const VectorXd& parameters) -> Linearisation {
     MatrixXd values;
@@ -78,6 +86,7 @@ Equations equations_of(const System& system, bool velocity) {
     const System::Residual& label = system.residual_labels()[k];
     if (label.velocity != velocity) continue;
     out.texts.push_back(label.text);
+    out.come_and_go.push_back(system.is_conditional(label.row));
     residuals.push_back(static_cast<int>(k));
     rows.push_back(label.row);
   }
@@ -139,6 +148,7 @@ class Completion {
       decomposition.setThreshold(1e-10);
       decomposition.compute(at.jacobian(Eigen::all, unknown_columns_));
       if (decomposition.rank() < static_cast<Index>(unknowns_.size())) {
+        require_present(at, sample);
         throw InputError(fmt::format(
             "{}: [sampling]: at {} the constraints decide only {} of the {} unknowns {}: draw some of them, "
             "or start elsewhere, start = {{ {} = … }}",
@@ -163,12 +173,42 @@ class Completion {
     const VectorXd scale = at.jacobian.cwiseAbs() * size;
     for (Index k = 0; k < at.residual.size(); ++k) {
       if (std::abs(at.residual[k]) <= 1e-9 * scale[k]) continue;
+      if (const auto equation = static_cast<std::size_t>(k); equations_.come_and_go[equation]) {
+        std::vector<int> read;
+        for (std::size_t j = 0; j < equations_.variables.size(); ++j) {
+          if (at.jacobian(k, static_cast<Index>(j)) != 0) read.push_back(equations_.variables[j]);
+        }
+        refuse_conditional(equation, names_of(read.empty() ? equations_.variables : read), sample);
+      }
       throw InputError(
           fmt::format("{}: [sampling]: sample {} ({}) is off the constraint \"{}\" by {:.3g}: leave one more of {} to be "
                       "solved from the constraints",
                       model_.name, sample + 1, describe(state), equations_.texts[static_cast<std::size_t>(k)], at.residual[k],
                       fmt::join(names_of(equations_.variables), ", ")));
     }
+  }
+
+  // Whether there would be enough equations, were it not for a condition that does not hold.
+  void require_present(const Linearisation& at, int sample) const {
+    std::optional<std::size_t> absent;
+    std::size_t n_present = 0;
+    for (std::size_t k = 0; k < equations_.texts.size(); ++k) {
+      if (!at.jacobian.row(static_cast<Index>(k)).isZero(0)) {
+        ++n_present;
+      } else if (equations_.come_and_go[k] && !absent) {
+        absent = k;
+      }
+    }
+    if (absent && n_present < unknowns_.size()) refuse_conditional(*absent, names_, sample);
+  }
+
+  // A constraint that is not there at every sample can neither be left to decide something, nor drawn past.
+  [[noreturn]] void refuse_conditional(std::size_t equation, const std::vector<std::string>& names, int sample) const {
+    throw InputError(fmt::format(
+        "{}: [sampling]: sample {}: the constraint \"{}\" is there at some of the samples only: give {}{} by an expression that "
+        "satisfies it, {} = \"…\"",
+        model_.name, sample + 1, equations_.texts[equation], names.size() > 1 ? "one of " : "", fmt::join(names, ", "),
+        names.front()));
   }
 
   [[nodiscard]] std::vector<std::string> names_of(const std::vector<int>& entries) const {
@@ -245,13 +285,14 @@ class Sampler {
 
   void add_completions() {
     if (const SymbolicSystem* symbolic = model_.symbolic_system()) {
-      std::vector<std::pair<Expression, std::string>> positions, velocities;
+      std::vector<WrittenEquation> positions, velocities;
       for (const ConstraintRow& row : symbolic->definition().constraints) {
+        const bool comes_and_goes = !row.condition.empty();
         if (row.level == Level::position) {
-          positions.emplace_back(row.residuals[0], row.text);
-          velocities.emplace_back(row.residuals[1], "d/dt of " + row.text);
+          positions.push_back({row.residuals[0], row.text, comes_and_goes});
+          velocities.push_back({row.residuals[1], "d/dt of " + row.text, comes_and_goes});
         } else if (row.level == Level::velocity) {
-          velocities.emplace_back(row.residuals[0], row.text);
+          velocities.push_back({row.residuals[0], row.text, comes_and_goes});
         }
       }
       const StateLayout layout = model_.system->layout();

@@ -58,7 +58,7 @@ bool has_redundant_rows(const System& system, const VectorXd& parameters, const 
   projection.apply(state);
   const MechanicsBatch mechanics = evaluate_mechanics(system, state, parameters);
   return !mechanics.projections.empty() && mechanics.projections[0].motion_is_determined() &&
-         ranks_of(system, mechanics)[0] < system.nc();
+         ranks_of(system, mechanics)[0].rank < system.nc();
 }
 
 class Integration {

@@ -258,6 +258,19 @@ Expression ExpressionGraph::apply(Operation operation, Expression a, Expression 
 
 namespace {
 
+/// Whether e is 1/n with a length |g| or √(g² + …) among the factors of n; under the root of arcus sine is a difference.
+bool is_over_length(Expression e) {
+  if (e.operation() != Operation::divide || !e.left().is_constant(1)) return false;
+  const auto is_length = [](Expression n) {
+    return n.operation() == Operation::abs || (n.operation() == Operation::sqrt && n.left().operation() != Operation::subtract);
+  };
+  Expression n = e.right();
+  for (; n.operation() == Operation::multiply; n = n.left()) {
+    if (is_length(n.right())) return true;
+  }
+  return is_length(n);
+}
+
 /// The derivative of e = f(a) or f(a, b), given those of its operands. A factor w that can be infinite enters as ȧ ⊗ w.
 Expression derivative(Expression e, Expression da, Expression db) {
   ExpressionGraph& graph = e.graph();
@@ -328,8 +341,12 @@ Expression derivative(Expression e, Expression da, Expression db) {
       const Expression order = function(Operation::sign, e.operation() == Operation::min ? b - a : a - b);
       return or_zero(number(0.5) + number(0.5) * order, da) + or_zero(number(0.5) - number(0.5) * order, db);
     }
-    case Operation::multiply_or_zero:
-      return or_zero(da, b) + or_zero(a, db);
+    case Operation::multiply_or_zero: {
+      if (!is_over_length(b)) return or_zero(da, b) + or_zero(a, db);
+      // a component over a length has the slope 0 where this is 0, as sign has at 0
+      const Expression sign = function(Operation::sign, b.right());
+      return or_zero(da, or_zero(sign * sign, b)) + or_zero(a, db);
+    }
   }
   return number(0);
 }

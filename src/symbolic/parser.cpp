@@ -306,7 +306,11 @@ class Parser {
     } catch (const InputError& error) {
       fail(start, error.what());
     }
-    if (!resolved) fail(start, fmt::format("unknown symbol '{}'; only a model with a robot has points", shortened(symbol, 40)));
+    if (!resolved) {
+      fail(start, fmt::format("unknown symbol '{}'; a model with a robot has the points site(\"NAME\").x, body(\"NAME\").x and "
+                              "point(\"BODY\", 0, 0, 0.1).x",
+                              shortened(symbol, 40)));
+    }
     return *resolved;
   }
 
@@ -342,6 +346,11 @@ class Parser {
       if (name == "pi" || resolve_(name)) {
         fail(position_, fmt::format("found '(' right after '{}', which is not a function; a product is written {}*(...)",
                                     shortened(name, 40), shortened(name, 40)));
+      }
+      const std::string_view kind = name.substr(std::min(name.find_first_not_of('d'), name.size()));
+      if (kind == "site" || kind == "body" || kind == "point") {
+        fail(start, fmt::format("the name in {0}(...) stands in quotes: write '{0}(\"NAME\"{1}).x'", name,
+                                kind == "point" ? ", 0, 0, 0.1" : ""));
       }
       std::vector<std::string_view> names;
       for (const Function& known : functions) names.push_back(known.text);

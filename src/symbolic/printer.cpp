@@ -155,6 +155,14 @@ bool is_quotient_or_zero(Expression e) {
          e.right().left().is_constant(1);
 }
 
+/// Whether e is a product that starts with a minus, which after another factor would be read as a difference.
+bool starts_with_minus(Expression e) {
+  while ((e.operation() == Operation::multiply || e.operation() == Operation::multiply_or_zero) && !is_quotient_or_zero(e)) {
+    e = e.left();
+  }
+  return e.operation() == Operation::negate || (e.is_constant() && e.constant_value() < 0);
+}
+
 /// Whether c*e, written without parentheses, reads back to c·e: e = u·v·… whose first factor is neither a quotient nor a number.
 bool continues_product(Expression e) {
   if (e.operation() != Operation::multiply) return false;
@@ -195,7 +203,7 @@ Written write_mathml(Expression e) {
       if (is_quotient_or_zero(e)) return write_mathml_quotient(e.left(), e.right().right());
       // a thin space around the invisible times; a dot between numbers
       const char* const times = starts_with_number(e.right()) ? "<mo>·</mo>" : "<mo lspace=\"0.16em\" rspace=\"0\">&#x2062;</mo>";
-      return {{{e.left(), in_product}, times, {e.right(), in_product}}, in_product};
+      return {{{e.left(), in_product}, times, {e.right(), starts_with_minus(e.right()) ? in_power : in_product}}, in_product};
     }
     case Operation::divide:
       return write_mathml_quotient(e.left(), e.right());
@@ -243,7 +251,7 @@ Written write(Expression e, Notation notation) {
     case Operation::multiply: {
       const char* const times = !latex ? "*" : starts_with_number(e.right()) ? " \\cdot " : " \\, ";
       // c*u*v reads back as c·(u·v), and in LaTeX no one asks which product came first
-      const bool plain_chain = latex || (e.left().is_constant() && continues_product(e.right()));
+      const bool plain_chain = latex ? !starts_with_minus(e.right()) : e.left().is_constant() && continues_product(e.right());
       return {{{e.left(), in_product}, times, {e.right(), plain_chain ? in_product : in_power}}, in_product};
     }
     case Operation::divide:

@@ -250,9 +250,15 @@ void note_priors(const std::vector<Hyperparameter>& fitted, const std::vector<in
 void note_single_start(const FitReport& report, const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
   const VectorXd& stddev = report.uncertainty->stddev;
   const auto has_error = [&](int k) { return stddev[k] > 0 && std::isfinite(stddev[k]); };
-  if (report.restarts.size() != 1 || report.draws || std::none_of(parameters.begin(), parameters.end(), has_error)) return;
+  const std::size_t n_starts = report.inducing && report.inducing->n_starts > 1
+                                   ? static_cast<std::size_t>(report.inducing->n_starts)
+                                   : report.restarts.size();
+  if (n_starts != 1 || report.draws || std::none_of(parameters.begin(), parameters.end(), has_error)) return;
+  // through points few rows are fitted once, however many runs are asked for
+  const bool is_once = report.inducing && report.inducing->n_start == 0;
   notes.push_back({false, "the standard errors are those about the optimum of a single start",
-                   "Other starts may lead to a better one: fit with more `restarts`"});
+                   is_once ? "Other starts may lead to a better one: fit exactly (`inducing=none`), with several `restarts`"
+                           : "Other starts may lead to a better one: fit with more `restarts`"});
 }
 
 // Parameters that the data do not determine. Without hyper-priors combinations of other hyperparameters may be open too: of no

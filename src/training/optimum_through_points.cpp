@@ -76,6 +76,7 @@ class TrainingThroughPoints {
     report->inducing->left_out =
         is_set(options_.stop) ? left_out_as_some_tell(*report) : left_out(observations_, *report, all_workers());
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
+    report->inducing->n_starts = stages.size() > 1 ? std::max(1, options_.n_restarts) : 1;
     if (draws && !is_set(options_.stop))
       report->draws = drawn(evenly(observations_, n_exact), report->hyperparameters, of_stage(stages.size(), n_stages, n_exact));
     if (is_set(options_.stop)) {

@@ -53,6 +53,11 @@ TEST_F(BaselineCommand, RefusesWhatOnlyMechanicsHas) {
   const Outcome unknown = desk.run("gp2 fit models/surface.toml --data train.csv --baseline gp -o fit.json");
   EXPECT_EQ(unknown.status, 2);
   EXPECT_THAT(unknown.err, AllOf(HasSubstr("--baseline"), HasSubstr("gp"), HasSubstr("lmc")));
+  desk.done("gp2 fit models/surface.toml --data train.csv --baseline se --restarts 1 --max-iterations 2 -o fit.json");
+  const Outcome force = desk.run("gp2 predict fit.json --states test.csv --view force -o force.csv");
+  EXPECT_EQ(force.status, 2);
+  EXPECT_THAT(force.err, HasSubstr("--view force: a baseline learns accelerations, not forces: ask for --view constrained"));
+  EXPECT_FALSE(desk.has("force.csv"));
 }
 
 TEST_F(BaselineCommand, ASystemOfOtherFeaturesIsRefused) {

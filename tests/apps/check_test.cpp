@@ -193,6 +193,84 @@ TEST(Check, WarnsOfARowThatVanishes) {
               testing::ContainsRegex("warning +constraint .*of its usual size at state 3"));
 }
 
+// a belt that a constraint drives at a constant speed
+TEST(Check, TakesNoVelocityForStuckThatAConstraintHolds) {
+  const Desk desk;
+  const std::string belt = R"toml(
+coordinates = ["x", "belt"]
+[mechanics]
+mass = [["2", "0"], ["0", "1"]]
+force = ["-20*x", "0"]
+[constraints]
+position = ["belt - 0.5*t"]
+[[latent]]
+features = ["dx - dbelt"]
+directions = { force = [["1"], ["0"]] }
+[truth]
+force = ["-2*tanh(10*(dx - dbelt))", "0"]
+[sampling]
+x = [-0.2, 0.2]
+dx = [-1, 1]
+t = [0, 4]
+[noise]
+ddq = 0.05
+)toml";
+  const std::string stuck = "dbelt is the same in every row, while the system moves";
+  desk.write("belt.toml", belt);
+  desk.done("gp2 generate belt.toml --n 30 --noise-std 0.05 -o log.csv");
+  EXPECT_THAT(desk.done("gp2 check belt.toml --data log.csv").out, Not(HasSubstr("stuck")));
+  desk.write("speed.toml", replaced(belt, "position = [\"belt - 0.5*t\"]", "velocity = [\"dbelt - 0.5\"]"));
+  EXPECT_THAT(desk.done("gp2 check speed.toml --data log.csv").out, Not(HasSubstr("stuck")));
+  // one that says nothing of the belt
+  desk.write("free.toml", replaced(belt, "belt - 0.5*t", "x - 0.2*sin(t)"));
+  EXPECT_THAT(desk.run("gp2 check free.toml --data log.csv").out, HasSubstr(stuck));
+}
+
+/// A bead on a wire z = x²/2 beside a belt that rubs, whose potential is told.
+std::string bead_with(const std::string& potential) {
+  return R"toml(
+coordinates = ["x", "z"]
+inputs = ["push"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+force = ["push - 0.2*tanh(dx - 1)", "-9.81"]
+potential = ")toml" +
+         potential + R"toml("
+[constraints]
+position = ["z - 0.5*x^2"]
+[[latent]]
+features = ["dx"]
+[truth]
+force = ["-dx", "0"]
+[sampling]
+x = [-1, 1]
+dx = [-1, 1]
+push = [-1, 1]
+)toml";
+}
+
+TEST(Check, WarnsOfAPotentialThatContradictsTheForce) {
+  const Desk desk;
+  const auto check_of = [&](const std::string& text) {
+    desk.write("model.toml", text);
+    return desk.done("gp2 check model.toml").out;
+  };
+  const auto driven = [](const std::string& force, const std::string& potential) {
+    return "coordinates = [\"x\"]\n[mechanics]\nmass = [[\"1\"]]\nforce = [\"" + force + "\"]\npotential = \"" + potential +
+           "\"\n[[latent]]\nfeatures = [\"dx\"]\n[truth]\nforce = [\"-dx\"]\n[sampling]\nx = [-1, 1]\ndx = [-1, 1]\nt = [0, 5]\n";
+  };
+  const std::string wrong = "potential: at rest the force is farther from -dV/dq than from 0";
+  EXPECT_THAT(check_of(driven("-9.81*sin(x)", "9.81*cos(x)")), testing::ContainsRegex("warning +" + wrong));
+  EXPECT_THAT(check_of(driven("-9.81*sin(x)", "-9.81*cos(x)")), Not(HasSubstr(wrong)));
+  EXPECT_THAT(check_of(bead_with("-9.81*z")), HasSubstr(wrong));
+  EXPECT_THAT(check_of(bead_with("9.81*z")), Not(HasSubstr(wrong)));
+  EXPECT_THAT(check_of(bead_with("4.905*x^2")), Not(HasSubstr(wrong))) << "the same on the wire";
+  // forces that have no potential
+  EXPECT_THAT(check_of(driven("-x + 3*sin(t)", "x^2/2")), Not(HasSubstr(wrong)));
+  EXPECT_THAT(check_of(driven("3 - x", "x^2/2")), Not(HasSubstr(wrong)));
+  EXPECT_THAT(check_of(driven("-x - 0.3*sign(dx)", "x^2/2")), Not(HasSubstr(wrong)));
+}
+
 TEST(Check, WithoutSamplingOrDataSaysThatNothingWasEvaluated) {
   const Desk desk;
   desk.write("model.toml", particle(R"([["1", "0"], ["0", "1"]])", R"(["ddq2"])"));

@@ -56,6 +56,36 @@ TEST(ExportCommand, ReplacesNoneOfItsFilesWhereOneCannotBeWritten) {
   EXPECT_EQ(desk.read("out/duffing.h"), "old");
 }
 
+// Off the wire the latent is unknown, so that what is known along it is a small part of its deviation.
+TEST(ExportCommand, RefusesFloatsWhereTheyAreCoarserThanTheDeviationOfTheMotion) {
+  const Desk desk;
+  desk.write("bead.toml", R"toml(
+coordinates = ["x", "z"]
+inputs      = ["u"]
+[mechanics]
+mass  = [["0.2", "0"], ["0", "0.2"]]
+force = ["u", "-9.81*0.2"]
+[constraints]
+position = ["z - 0.5*x^2"]
+[[latent]]
+features = ["x", "dx"]
+[noise]
+ddq = 0.02
+[truth]
+acceleration = ["-8*dx - 2*x - 2*sin(x)", "-8*dz"]
+[sampling]
+x  = [-1, 1]
+dx = [-1.5, 1.5]
+u  = [-1, 1]
+)toml");
+  desk.done("gp2 generate bead.toml --n 15 --seed 1 -o log.csv");
+  desk.done("gp2 fit bead.toml --data log.csv --mean force --restarts 1 --hyperparameters optimise -o fit.json");
+  const Outcome outcome = desk.run("gp2 export fit.json --float --name bead -o .");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_THAT(outcome.err, HasSubstr("in single precision the mean would be off by up to"));
+  desk.done("gp2 export fit.json --name bead -o .");
+}
+
 // A fitted mass and damping of a linkage in a copy of its file.
 class RobotExportCommand : public testing::Test {
  protected:

@@ -60,6 +60,15 @@ TEST_F(FitAgain, SaysWhichLogIsNotTheOneThatWasLearnedFrom) {
     EXPECT_THAT(desk.done("gp2 update more.json --data " + log + " -o twice.json").err,
                 HasSubstr("warning: " + log + " is already in the fit: its rows count twice"));
   }
+  // but not of what the window leaves behind, under this name or another
+  desk.done("head -1 new.csv > sorted.csv && tail -n +2 new.csv | sort >> sorted.csv");
+  for (const std::string data : {"--data new.csv", "--data sorted.csv", "--data more.csv --data new.csv"}) {
+    EXPECT_THAT(desk.done("gp2 update more.json " + data + " --window 12 -o twice.json").err, Not(HasSubstr("warning"))) << data;
+  }
+  EXPECT_THAT(desk.done("gp2 update more.json --data new.csv --window 20 -o twice.json").err,
+              HasSubstr("warning: new.csv is already in the fit: its rows count twice"));
+  EXPECT_THAT(desk.done("gp2 update more.json --data sorted.csv --window 20 -o twice.json").err,
+              HasSubstr("rows are also in another log"));
 }
 
 TEST_F(FitAgain, StartsWhereTheFitStarted) {

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 #include <set>
 
@@ -195,8 +196,9 @@ TEST_F(FitCommand, StartRefusesWhatItDoesNotKnowOrMayNotTake) {
   EXPECT_THAT(refusal("--start absent.json"), HasSubstr("absent.json: cannot be read"));
 }
 
-TEST_F(FitCommand, MaxPointsTakesTheFirstRowsOfAShuffleBySeed) {
-  const std::vector<int> order = RandomStream(7).permutation(30);
+TEST_F(FitCommand, MaxPointsTakesTheFirstRowsOfAShuffleBySeedInTheOrderOfTheLog) {
+  std::vector<int> order = RandomStream(7).permutation(30);
+  std::sort(order.begin(), order.begin() + 8);
   const Outcome outcome =
       desk.done("gp2 fit models/surface.toml --data train.csv --max-points 8 --seed 7 --max-iterations 0 -o fit.json");
   EXPECT_THAT(outcome.err, HasSubstr("8 of 30 rows taken, by seed 7"));
@@ -229,6 +231,16 @@ TEST_F(FitCommand, EstimateChoosesTheParameters) {
   const std::string line = "gp2 fit eager.toml --data train.csv --max-iterations 0 --json -o fit.json";
   EXPECT_TRUE(names(desk.done(line).json()).contains("p1"));
   EXPECT_EQ(names(desk.done(line + " --estimate none").json()), nothing);
+}
+
+TEST_F(FitCommand, SaysWhichEstimatesOfTheFitItStartsFromItDoesNotTake) {
+  fit("--restarts 1 --max-iterations 3 --estimate p1,p5", "before.json");
+  const Outcome again = desk.done(
+      "gp2 fit models/surface.toml --data train.csv --max-iterations 3 --restarts 1 "
+      "--start before.json --estimate p1 -o fit.json");
+  EXPECT_THAT(again.err, testing::AllOf(testing::HasSubstr("before.json: p5 = "),
+                                        testing::HasSubstr(" is not taken: this fit does not estimate it and has ")));
+  EXPECT_FALSE(again.said("p1 = "));
 }
 
 TEST_F(FitCommand, ParametersHaveStandardErrorsUnlessNotWanted) {

@@ -459,5 +459,23 @@ TEST_F(SimulateFit, MapRefusesNamesThatNobodyHas) {
   desk.done("gp2 simulate fit.json --start train.csv --inputs inputs.csv --map push=u1 --t-end 0.1 -o motion.csv");
 }
 
+// The learned potential is not all of the energy where a known force acts at rest.
+TEST(SimulatePotential, ReportsNoEnergyThatLacksTheKnownForce) {
+  Desk desk;
+  const auto motion_with = [&](const std::string& potential) {
+    desk.write("spring.toml",
+               "coordinates = ['q']\n[mechanics]\nmass = [[1]]\nforce = ['-9.81*sin(q)']\n" + potential +
+                   "[[latent]]\nname = 'spring'\nfeatures = ['q']\ndirections = 'potential'\n[truth]\nforce = ['-2*q']\n[noise]\n"
+                   "ddq = 0.01\n[sampling]\nq = [-1.5, 1.5]\ndq = [-1, 1]\n");
+    desk.done("gp2 generate spring.toml --n 20 -o train.csv");
+    desk.done("gp2 fit spring.toml --data train.csv --mean force --restarts 1 --hyperparameters optimise -o fit.json");
+    return desk.done("gp2 simulate fit.json --start q=1 --t-end 0.5 -o motion.csv");
+  };
+  EXPECT_TRUE(motion_with("").said("no energy: spring.toml has a learned potential, but the known force acts at rest"));
+  EXPECT_EQ(desk.table("motion.csv").find("energy"), -1);
+  EXPECT_FALSE(motion_with("potential = '-9.81*cos(q)'\n").said("no energy"));
+  EXPECT_GE(desk.table("motion.csv").find("energy"), 0);
+}
+
 }  // namespace
 }  // namespace gp2::test

@@ -214,6 +214,22 @@ TEST_F(Transfer, AWindowMayLeaveNothingOfALog) {
   }
 }
 
+TEST_F(Transfer, SaysWhichEstimatesAreNotTaken) {
+  static_cast<void>(fit("--data train.csv --mean force --estimate m,p4"));
+  desk.write("marked.toml", replaced(desk.read("other.toml"), "m  = 4.0", "m  = { value = 4, estimate = true }"));
+  const std::string there = "other.toml: parameter 'm' stays 4 there while it is estimated in 'models/surface.toml'; mark it ";
+  const std::string p4 = "parameter 'p4' stays ";
+  for (const std::string command : {"predict fit.json --states test.csv -o there.csv", "evaluate fit.json --data test.csv",
+                                    "simulate fit.json --start q1=0.1 --t-end 0.01 -o motion.csv", "export fit.json -o .",
+                                    "report fit.json --data test.csv -o report.html"}) {
+    EXPECT_THAT(desk.done("gp2 " + command + " --system other.toml").err, AllOf(HasSubstr(there), HasSubstr(p4))) << command;
+    EXPECT_THAT(desk.done("gp2 " + command + " --system marked.toml").err,
+                AllOf(testing::Not(HasSubstr("parameter 'm'")), HasSubstr(p4)))
+        << command;
+    EXPECT_FALSE(desk.done("gp2 " + command).said("stays")) << command;
+  }
+}
+
 TEST_F(Transfer, RefusesWhatDoesNotFit) {
   desk.write("kernel.toml", replaced(desk.read("models/surface.toml"), "kernel     = \"se\"", "kernel     = \"matern52\""));
   EXPECT_THAT(

@@ -161,7 +161,8 @@ TEST(Csv, IsMadeOfCellsToo) {
   const CsvTable table = from_cells({"q1", "q2"}, {"1", "2", "-3.5e-2", "nan"});
   EXPECT_EQ(table.n_rows(), 2);
   EXPECT_EQ(table.number(1, 0), -3.5e-2);
-  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(1, 1)); }), "frame:3: column 'q2': 'nan' is not a finite number");
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(1, 1)); }),
+            "frame: row 2, column 'q2': 'nan' is not a finite number");
 }
 
 TEST(Csv, RefusesCellsThatAreNoTable) {
@@ -184,11 +185,22 @@ TEST(Csv, IsMadeOfColumnsOfNumbersWithoutPrintingThem) {
   EXPECT_EQ(table.number(0, 0), 0.1);
   EXPECT_TRUE(std::isnan(table.number_or_empty(1, 0)));
   EXPECT_TRUE(std::isnan(table.number_or_nan(2, 0)));
-  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(2, 0)); }), "frame:4: column 'x': '-inf' is not a finite number");
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(2, 0)); }),
+            "frame: row 3, column 'x': '-inf' is not a finite number");
   EXPECT_EQ(table.number(0, 1), 7);
   EXPECT_EQ(table.cell(0, 1), "007");
   EXPECT_EQ(table.text(), "x,label\n0.1,007\n,\n-inf,late\n");
   EXPECT_EQ(table.take({2, 0}).text(), "x,label\n-inf,late\n0.1,007\n");
+}
+
+TEST(Csv, CountsRowsFrom1WhereThereAreNoLines) {
+  const CsvTable columns = CsvTable::from_columns("frame", {{"x", {1, 2, 3}}}), lines = parse("x\n1\n\n2\n");
+  EXPECT_FALSE(columns.has_lines());
+  EXPECT_TRUE(lines.has_lines());
+  EXPECT_EQ(columns.take({2}).place(0, 0), "frame: row 3, column 'x'");
+  EXPECT_EQ(columns.renamed("other").place(1, 0), "other: row 2, column 'x'");
+  EXPECT_EQ(lines.renamed("other").place(1, 0), "other:4: column 'x'");
+  EXPECT_EQ(lines.without_lines().place(1, 0), "log.csv: row 2, column 'x'");
 }
 
 TEST(Csv, WritesNoCellThatWouldNotReadBack) {

@@ -154,6 +154,7 @@ TEST_F(LogReaderTest, AMissingColumnIsRefusedWithWhatWasTriedAndWhatThereIs) {
   // others are there: this one may have another name
   EXPECT_THAT(input_error_of([&] { state("q1,dq1,omega\n1,2,3\n", "dq2"); }), HasSubstr("omega. Rename it, or give `map="));
   EXPECT_THAT(input_error_of([&] { state("dq1\n1\n", "q2"); }), HasSubstr("dq1. Rename it, or give `map="));
+  EXPECT_THAT(input_error_of([&] { state("t,q1\n0,1\n", "q2"); }), HasSubstr("q1. It has no velocities: gp2 derive"));
   EXPECT_THAT(
       input_error_of([&] { value("q1,q2,dq1,dq2\n1,2,3,4\n", "ddq1"); }),
       HasSubstr("It has no accelerations: gp2 derive computes them from positions over time, as a fit of a raw log does; or "

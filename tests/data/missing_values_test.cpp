@@ -89,22 +89,23 @@ TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
   EXPECT_EQ(input_error_of([] {
               problem_of(gappy_log_of({{"ddq2", 4, "nan"}}));
             }),
-            "log.csv:6: column 'ddq2': 'nan' is not a finite number");
+            "log.csv: row 5, column 'ddq2': 'nan' is not a finite number");
   EXPECT_EQ(input_error_of([] {
               problem_of(gappy_log_of({{"ddq2", 4, "lost"}}));
             }),
-            "log.csv:6: column 'ddq2': 'lost' is not a finite number");
+            "log.csv: row 5, column 'ddq2': 'lost' is not a finite number");
   EXPECT_EQ(input_error_of([] {
               problem_of(gappy_log_of({{"ddq2", -1, ""}}));
             }),
-            "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; observe others (`observe`)");
+            "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; choose others with `observe` of "
+            "a fit, `outputs` of an evaluation");
   FitProblemOptions others;
   others.observe = {"ddq1", "ddq3"};
   EXPECT_EQ(problem_of(gappy_log_of({{"ddq2", -1, ""}}), others).observations.front().values().rows(), 2);
   EXPECT_EQ(input_error_of([] {
               problem_of(gappy_log_of({{"dq2", 4, ""}}));
             }),
-            "log.csv:6: column 'dq2': the cell is empty; a number is needed here");
+            "log.csv: row 5, column 'dq2': the cell is empty; a number is needed here");
 }
 
 TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
@@ -118,12 +119,13 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
                                       "ddq3 (1 without a standard deviation)"));
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
   for (const char* text : {"0", "-0.1"}) {
-    EXPECT_EQ(input_error_of([&] {
-                problem_of(gappy_log_of({{"ddq1_std", 3, text}}, stated));
-              }),
-              fmt::format("log.csv:5: column 'ddq1_std': the standard deviation of ddq1 must be positive, got {}; leave the cell "
-                          "empty where nothing is measured",
-                          text));
+    EXPECT_EQ(
+        input_error_of([&] {
+          problem_of(gappy_log_of({{"ddq1_std", 3, text}}, stated));
+        }),
+        fmt::format("log.csv: row 4, column 'ddq1_std': the standard deviation of ddq1 must be positive, got {}; leave the cell "
+                    "empty where nothing is measured",
+                    text));
   }
   // a column without any deviation is not observed, unless that is asked for
   EXPECT_THAT(problem_of(gappy_log_of({{"ddq1_std", -1, ""}}, stated)).notes,

@@ -287,12 +287,13 @@ TEST(CSourceTest, NamesOfTheModelMayBeThoseOfFunctionsOfC) {
   const Model model = Model::parse(R"toml(
 coordinates = ["square"]
 [parameters]
-pow  = 2.5
-fabs = 0.3
-sinf = 0.7
+pow    = 2.5
+fabs   = 0.3
+sinf   = 0.7
+FP_NAN = 0.2
 [mechanics]
 mass  = [["2 + sin(square)*sinf"]]
-force = ["-fabs*(square + dsquare + 1)^2 - abs(dsquare)*fabs - (square^2 + 4)^pow"]
+force = ["-fabs*(square + dsquare + 1)^2 - abs(dsquare)*fabs - FP_NAN*dsquare - (square^2 + 4)^pow"]
 [[latent]]
 features   = ["square", "dsquare"]
 directions = "force"
@@ -558,8 +559,28 @@ TEST(CSourceTest, InSinglePrecisionIsRefusedWhereItWouldShow) {
   for (VectorXd& noise : p.values.noise_stddev) noise *= 1e-4;
   for (VectorXd& kernel : p.values.kernel) kernel *= 5;
   EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
-              testing::AllOf(HasSubstr("export to C: in single precision latent "),
-                             HasSubstr("its weights cancel. Fewer rows or a larger noise help, or leave `float` out")));
+              testing::AllOf(HasSubstr("export to C: in single precision the mean would be off by up to "),
+                             HasSubstr(" cancel. Fewer rows or a larger noise help, or leave `float` out")));
+}
+
+// What was observed is the prior's mean, so that there are no weights that could cancel.
+TEST(CSourceTest, InSinglePrecisionIsRefusedWhereTheVarianceWouldBeRounding) {
+  Problem p = problem_of("surface");
+  const View view = View::constrained_acceleration(*p.prior.system);
+  const MatrixXd states = p.observations[0].states();
+  p.observations = {
+      {states, view, test::posterior_of(p).without_data().mean(view, states), VectorXd::Constant(view.size(), 0.3)}};
+  RandomStream random(export_seed);
+  p.values = test::random_values(p.prior, p.observations, random);
+  for (VectorXd& noise : p.values.noise_stddev) noise *= 1e-4;
+  CSourceOptions options;
+  options.single_precision = true;
+  const Posterior posterior = test::posterior_of(p);
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(posterior, view, options)); }),
+              testing::AllOf(HasSubstr("export to C: in single precision the variance would be off by up to "),
+                             HasSubstr("leave the standard deviation or `float` out")));
+  options.stddev = false;
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(export_c(posterior, view, options)); }), "");
 }
 
 // seven digits hold no second of a Unix time
@@ -594,14 +615,93 @@ features = ["x"]
   EXPECT_THAT(error_at(1.7e9), HasSubstr("in single precision the states themselves are too coarse"));
 }
 
+// The last row follows from the others only where x and y are on the circle to all digits.
+TEST(CSourceTest, InSinglePrecisionIsRefusedWhereRedundantRowsBecomeIndependent) {
+  const Model model = Model::parse(R"toml(
+name        = "bead on a wheel"
+coordinates = ["x", "y", "phi"]
+[mechanics]
+mass = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "2"]]
+[constraints]
+position = ["x - cos(phi)", "y - sin(phi)"]
+velocity = ["x*dx + y*dy"]
+[[latent]]
+features   = ["dphi"]
+directions = "force"
+)toml",
+                                   "bead on a wheel");
+  Problem p;
+  p.prior = make_prior(model, {});
+  RandomStream random(export_seed);
+  MatrixXd states = test::random_matrix(7, 6, random);
+  states.row(0) = states.row(2).array().cos();
+  states.row(1) = states.row(2).array().sin();
+  states.row(3) = -states.row(1).cwiseProduct(states.row(5));
+  states.row(4) = states.row(0).cwiseProduct(states.row(5));
+  const View view = View::constrained_acceleration(*model.system);
+  p.observations = {{states, view, MatrixXd(test::random_matrix(3, 6, random)), VectorXd::Constant(3, 0.3), false}};
+  p.values = test::random_values(p.prior, p.observations, random);
+  CSourceOptions options;
+  options.single_precision = true;
+  EXPECT_THAT(
+      input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
+      HasSubstr("export to C: in single precision redundant constraints are no longer redundant: rounding a state takes the "
+                "rank of A from 2 to 3. Leave out rows that follow from others, or leave `float` out"));
+}
+
+TEST(CSourceTest, IsNotCompiledWithoutNaN) {
+  const CSource c = export_c(test::posterior_of(problem_of("surface")), problem_of("surface").observations[0].view());
+  for (const char* const option : {"-ffast-math", "-ffinite-math-only"}) {
+    std::string error;
+    try {
+      const Exported compiled(c, "gp2_model", std::string("gcc -O1 ") + option);
+    } catch (const std::runtime_error& refused) {
+      error = refused.what();
+    }
+    EXPECT_THAT(error, HasSubstr("compile without -ffast-math and -ffinite-math-only")) << option;
+  }
+}
+
+TEST(CSourceTest, SaysWhyNoStateHasAPrediction) {
+  const Model model = Model::parse(R"toml(
+name        = "massless"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["1", "0"], ["0", "0"]]
+force = ["-x", "0"]
+[constraints]
+position = ["y - x"]
+[[latent]]
+features   = ["x", "dx"]
+directions = "force"
+)toml",
+                                   "massless");
+  Problem p;
+  p.prior = make_prior(model, {Prior::Mean::force, std::nullopt, false});
+  RandomStream random(export_seed);
+  MatrixXd states = test::random_matrix(5, 6, random);
+  states.row(1) = states.row(0);
+  states.row(3) = states.row(2);
+  p.observations = {{states, View::constrained_acceleration(*model.system), MatrixXd(test::random_matrix(2, 6, random)),
+                     VectorXd::Constant(2, 0.3), false}};
+  p.values = test::random_values(p.prior, p.observations, random);
+  const View view = View::all(Quantity::unconstrained_acceleration, *model.system);
+  EXPECT_THAT(
+      input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view)); }),
+      testing::AllOf(HasSubstr("no observed state has a prediction of this view, so that there is nothing to test it by: "),
+                     HasSubstr("the mass matrix M is singular")));
+}
+
 TEST(CSourceTest, SaysWhatCannotBeWritten) {
   const Problem p = problem_of("surface");
   const View view = View::constrained_acceleration(*p.prior.system);
   CSourceOptions options;
-  options.name = "double";
-  EXPECT_THAT(
-      input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
-      HasSubstr("`name`: must be a name of C, of letters, digits and _, that the code does not use itself, got 'double'"));
+  for (const char* const name : {"double", "evaluate"}) {
+    options.name = name;
+    EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
+                HasSubstr(fmt::format(
+                    "`name`: must be a name of C, of letters, digits and _, that the code does not use itself, got '{}'", name)));
+  }
   EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p).without_data(), view)); }),
               HasSubstr("export to C: nothing was observed"));
 

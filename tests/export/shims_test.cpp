@@ -4,6 +4,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -325,11 +326,18 @@ TEST(ExportJobTest, SaysWhichOptionsDoNotGoTogether) {
   request.name = "two__underscores";
   EXPECT_THAT(error(request),
               testing::HasSubstr("`name`: CasADi takes names that begin with a letter and have single underscores"));
+  for (const char* const name : {"NQ", "set", "exp"}) {
+    request.name = name;
+    EXPECT_EQ(error(request), fmt::format("`name`: the code for CasADi uses '{}' itself; choose another", name));
+  }
   request.single_precision = true;
   EXPECT_THAT(error(request), testing::HasSubstr("`float` goes with `to=c`: CasADi and acados compute in double precision"));
   request = {};
   request.to = ExportRequest::Target::acados;
-  EXPECT_THAT(error(request), testing::HasSubstr("`to=acados` needs the time step of the solver: `dt=SECONDS`, positive"));
+  EXPECT_THAT(error(request),
+              testing::HasSubstr("`to=acados` needs the time step of the solver: `dt=SECONDS`, positive and finite"));
+  request.view.time_step = std::numeric_limits<double>::infinity();
+  EXPECT_THAT(error(request), testing::HasSubstr("`dt=SECONDS`, positive and finite"));
   request.view.time_step = 0.01;
   request.jacobian = false;
   EXPECT_THAT(error(request), testing::HasSubstr("`to=acados` needs the Jacobian, which was left out"));
@@ -344,6 +352,8 @@ TEST(ExportJobTest, LeavesDrawsOutThatOthersStandFor) {
   ExportRequest request;
   request.draws_within = 0.1;
   EXPECT_THAT(export_fit(fit, posterior, request).notes, testing::ElementsAre("1 of 3 draws represent all"));
+  EXPECT_THAT(export_fit(fit, posterior.component(0), request).notes,
+              testing::ElementsAre("`draws_within` changes nothing: the fit has one set of hyperparameters, not draws of them"));
 }
 
 }  // namespace

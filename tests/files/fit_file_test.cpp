@@ -332,6 +332,7 @@ FitFile fit_through_points() {
   inducing.n_variables = choice.n_variables;
   inducing.left_out = Eigen::VectorXd::Constant(std::ssize(choice.points->features), 0.25);
   inducing.n_start = 4;
+  inducing.n_starts = 3;
   inducing.summary = fit.posterior().summary();
   inducing.stretches.emplace().pit = Eigen::VectorXd::Constant(Calibration::n_bins, 0.1);
   return fit;
@@ -342,7 +343,8 @@ TEST(FitFile, InducingPointsSurvive) {
   const FitFile fit = fit_through_points(), read = written_and_read(fit);
   const InducingReport &a = *fit.report.inducing, &b = read.report.inducing.value();
   EXPECT_EQ(b.points->features, a.points->features);
-  EXPECT_EQ(std::tie(b.n_variables, b.left_out, b.n_start), std::tie(a.n_variables, a.left_out, a.n_start));
+  EXPECT_EQ(std::tie(b.n_variables, b.left_out, b.n_start, b.n_starts),
+            std::tie(a.n_variables, a.left_out, a.n_start, a.n_starts));
   expect_same_predictions(fit, read);
   EXPECT_NE(fit.posterior().negative_log_likelihood(), fit_of(unicycle()).posterior().negative_log_likelihood());
   // a posterior without them is another

@@ -515,7 +515,7 @@ TEST(InverseDynamicsSolverTest, NamesWhatIsWrongWithAnArgument) {
   EXPECT_THAT(refusal([&] { return bare.inputs(state, wanted, inputs, workspace); }),
               HasSubstr("the workspace is of another solver"));
   EXPECT_THAT(refusal([&] { return bare.inputs_and_covariance(state, wanted, inputs, covariance, workspace); }),
-              HasSubstr("it was made without Options::covariance"));
+              HasSubstr("it was made without covariances"));
   EXPECT_THAT(refusal([&] { return other.inputs(state.head(3), wanted, inputs, workspace); }),
               HasSubstr("a state is of size 7, got 3"));
   EXPECT_THAT(refusal([&] { return other.inputs(state, three, inputs, workspace); }),

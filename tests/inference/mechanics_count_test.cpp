@@ -89,6 +89,11 @@ TEST(MechanicsCountTest, APosteriorEvaluatesThemOnceForItsDataAndOnceForEachUpda
   EXPECT_EQ(c.count(), 1);
   posterior = remove_oldest(std::move(posterior), 3);
   EXPECT_EQ(c.count(), 0);
+  // where most go, what is left is conditioned anew, and where all go there is nothing left to evaluate
+  posterior = remove_oldest(std::move(posterior), 25);
+  EXPECT_EQ(c.count(), 1);
+  posterior = remove_oldest(std::move(posterior), 12);
+  EXPECT_EQ(c.count(), 0);
 }
 
 }  // namespace

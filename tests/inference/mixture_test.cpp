@@ -264,7 +264,7 @@ TEST(Mixture, OfNothingIsRefused) {
   EXPECT_EQ(test::input_error_of([&] { static_cast<void>(mixture_of(p).components({})); }),
             "Posterior::components: there are none");
   EXPECT_EQ(test::input_error_of([&] { static_cast<void>(mixture_of(p).fewest_components(0)); }),
-            "Posterior::fewest_components: the error must be above 0");
+            "fewest_components: the largest error must be above 0");
 }
 
 }  // namespace

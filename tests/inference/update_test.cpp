@@ -109,6 +109,31 @@ TEST(UpdateTest, RemovesInTheOrderOfAdding) {
   }
 }
 
+// most of them: what is left is conditioned anew, and keeps its order and the numbers by which the next go
+TEST(UpdateTest, RemovesMostInTheOrderOfAddingToo) {
+  for (const Problem& p : test::problems(9, update_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, update_seed));
+    Ages ages;
+    for (std::size_t group = 0; group < p.observations.size(); ++group) {
+      for (Index column = 0; column < p.observations[group].n_data(); ++column) ages.emplace_back(group, column);
+    }
+    if (ages.size() < 4) continue;
+    Posterior posterior(p.prior, p.observations, p.values);
+    const Posterior held = posterior;
+    const double before = held.negative_log_likelihood();
+    for (const int n : {static_cast<int>(ages.size()) - 2, 1, 2}) {
+      const Index column = n % p.observations[0].n_data();
+      posterior = remove_oldest(std::move(posterior), n);
+      ages.erase(ages.begin(), ages.begin() + n);
+      expect_equal(posterior, built_anew(p, ages), p);
+      posterior = update(std::move(posterior), part_of(p, 0, {column}));
+      ages.emplace_back(0, column);
+      expect_equal(posterior, built_anew(p, ages), p);
+    }
+    EXPECT_EQ(held.negative_log_likelihood(), before);
+  }
+}
+
 TEST(UpdateTest, AWindowThatMovesForLongDoesNotDrift) {
   const Problem p = test::problems(30, update_seed).front();
   ASSERT_EQ(p.observations.size(), 1U);

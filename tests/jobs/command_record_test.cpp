@@ -1,5 +1,7 @@
 #include "gp2/jobs/command_record.hpp"
 
+#include <algorithm>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -53,11 +55,12 @@ TEST(CommandRecord, WhatActsIsWhatTheSimulationHad) {
 
 TEST(CommandRecord, RowsOfALogAreToldByTheWholeLog) {
   const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
-  const std::vector<int> some = {150, 40, 90};
+  std::vector<int> some = {150, 40, 90};
   FitProblemOptions options = with_force();
   options.commands = log;
   const MatrixXd all = states_read(late_cart(both), log), chosen = states_read(late_cart(both), log.take(some), options);
   ASSERT_EQ(chosen.cols(), 3);
+  std::ranges::sort(some);  // rows are taken in the order of time
   for (int k = 0; k < 3; ++k) EXPECT_EQ(chosen(3, k), all(3, some[static_cast<std::size_t>(k)] - 22));
 }
 
@@ -106,10 +109,9 @@ TEST(CommandRecord, NeedsTimesInOrderAndRowsLateEnough) {
       error_of(without_time),
       "no time: u acts late, which takes the times of the whole log, but it has no column t; it has: x, dx, ddx, u. Where its "
       "inputs are what acts, give the model no delay and no lag");
-  EXPECT_EQ(
-      error_of(log.take({3, 2})),
-      "late cart: u acts late, which takes rows in the order of time, but late cart:4: column 't' has t = 0.02 after 0.03. Sort "
-      "the rows, or name what belongs together in a column 'episode'");
+  EXPECT_EQ(error_of(log.take({3, 2})),
+            "late cart: u acts late, which takes rows in the order of time, but late cart: row 3, column 't' has t = 0.02 after "
+            "0.03. Sort the rows, or name what belongs together in a column 'episode'");
   EXPECT_EQ(error_of(log.first_rows(20)),
             "late cart: the acting inputs are not known at any row: they all depend on commands before the log; give the whole "
             "log as `commands`, a longer one, or narrower bounds of delays and lags");

@@ -703,8 +703,8 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
               })),
               HasSubstr("0 samples are too few"));
   EXPECT_THAT(fault(edit([](auto& rows) { rows[7][1] = "1,5"; })),
-              HasSubstr("log.csv:9: column 'q1': '1,5' is not a finite number"));
-  EXPECT_THAT(fault(edit([](auto& rows) { rows[7][0] = ""; })), HasSubstr("log.csv:9: column 't': the cell is empty"));
+              HasSubstr("log.csv: row 8, column 'q1': '1,5' is not a finite number"));
+  EXPECT_THAT(fault(edit([](auto& rows) { rows[7][0] = ""; })), HasSubstr("log.csv: row 8, column 't': the cell is empty"));
   EXPECT_THAT(fault(cart_log([](auto&) {}, {"clock", "q1"})),
               HasSubstr("log.csv: missing column 't' (looked for t, time, timestamp, __time)"));
   EXPECT_THAT(

@@ -400,6 +400,20 @@ TEST(Excitation, NamesTheLimitThatNoMotionKeepsAndByHowMuch) {
                             "[0-9.]+ beyond -0\\.05:0\\.05\\. Widen that limit, shorten `duration`, or `start` elsewhere"));
 }
 
+TEST(Excitation, SaysWhatHelpsWhereNoMotionCouldBeIntegrated) {
+  ExciteRequest request = short_request();
+  request.duration = 2000;  // of a swing within a second or two, in 600 steps
+  try {
+    crane_bench().excite(request);
+    FAIL() << "ten steps a row do not follow it";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(),
+                testing::AllOf(testing::StartsWith("excite: none of "),
+                               testing::EndsWith("use more `rows` (10 steps of the integrator are allowed per row), or "
+                                                 "smaller limits")));
+  }
+}
+
 TEST(Excitation, IsRefusedOfFitsThatKnowNothingToAskFor) {
   const Bench& bench = crane_bench();
   ExciteRequest request = short_request();

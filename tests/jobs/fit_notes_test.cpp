@@ -1,7 +1,10 @@
+#include <cmath>
+
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
 #include "gp2/jobs/check_job.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "hyperparameter.hpp"
 #include "io_testing.hpp"
@@ -115,6 +118,27 @@ TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {
               HasSubstr("`protocol=paper` has one latent, on the acceleration, but 'cart' has 2"));
 }
 
+// A force along the normal of a curve changes no acceleration, but the constraint force.
+TEST(FitNotes, TellOfALatentThatTheConstraintsTakeUp) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0.5,3,3,5,14\n2,2,1,2,1,3\n0.5,0.125,1,0.5,2,2\n", "log.csv");
+  const auto told = [&](const std::string& direction) {
+    const Model model = Model::parse(
+        "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '2']]\nforce = ['0', '-9.81']\n[constraints]\n"
+        "position = ['y - 0.5*x^2']\n[[latent]]\nname = 'drag'\nkernel = 'se'\nfeatures = ['dx']\ndirections = { force = " +
+            direction + " }\n",
+        "wire");
+    FitProblemOptions options;
+    options.noise_stddev = 0.1;
+    return make_fit_problem(model, log, options).notes;
+  };
+  EXPECT_THAT(told("[['-x'], ['1']]"),
+              testing::Contains(HasSubstr("warning: latent 'drag' acts along the constraints, which take "
+                                          "it up, at all of 3 states")));
+  for (const std::string sound : {"[['1'], ['x']]", "[['0'], ['1']]", "[['-x'], ['1 + 1e-3*dx']]"}) {
+    EXPECT_THAT(told(sound), Not(testing::Contains(HasSubstr("take it up")))) << sound;
+  }
+}
+
 // What a latent reads of the load of the constraints may be none, or a choice.
 TEST(FitNotes, TellOfALatentThatActsNowhereAndOfLoadsThatAreShared) {
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0,3,0,5,0.1\n2,0,4,0,6,0\n3,0,5,0,6,-0.1\n", "log.csv");
@@ -143,6 +167,80 @@ TEST(FitNotes, TellOfALatentThatActsNowhereAndOfLoadsThatAreShared) {
   const std::string shared = told("['y', '2*y']", "lambda0(2)");
   EXPECT_THAT(shared, HasSubstr("warning: log.csv: lambda0(2): the constraint '2*y' follows from others"));
   EXPECT_THAT(shared, HasSubstr("check: lambda0(2): the constraint '2*y' follows from others"));
+}
+
+/// A sled whose friction is proportional to its load.
+Model sled(const std::string& load) {
+  return Model::parse(
+      "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\nforce = ['0', '-9.81']\n[constraints]\n"
+      "position = ['y']\n[[latent]]\nname = 'mu'\nkernel = 'constant'\nfeatures = ['x']\n"
+      "directions = { force = [['-dx*abs(" +
+          load + ")'], ['0']] }\n",
+      "sled");
+}
+
+TEST(FitNotes, TellThatALoadIsReadWithoutTheForceThatCausesIt) {
+  const auto notes = [](const std::string& load, Prior::Mean mean) {
+    FitRequest request;
+    request.model = sled(load);
+    request.logs = {{CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0,3,0,-5,0\n2,0,4,0,-6,0\n3,0,5,0,-7,0\n", "log.csv"), nullptr}};
+    request.problem.noise_stddev = 0.1;
+    request.problem.mean = mean;
+    return prepare_fit(std::move(request)).notes;
+  };
+  for (const std::string load : {"lambda", "lambda0"}) {
+    const auto told = Contains(HasSubstr("mu reads constraint forces (" + load + "), but the known force of [mechanics], which"));
+    EXPECT_THAT(notes(load + "(1)", Prior::Mean::zero), told);
+    EXPECT_THAT(notes(load + "(1)", Prior::Mean::force), Not(told));
+  }
+}
+
+// damping 0.3 dx, along a direction of either sign
+TEST(FitNotes, TellThatAPositiveLatentIsPushedToZero) {
+  const auto fit_along = [](const std::string& direction, const std::string& kernel, double steepness) {
+    std::string log = "x,dx,ddx\n";
+    for (int i = 0; i < 20; ++i) {
+      const double x = 0.1 * i - 1, dx = std::sin(3.0 * i);
+      log += fmt::format("{},{},{}\n", x, dx, -0.3 * (1 + std::tanh(steepness * x)) * dx);
+    }
+    const Model model = Model::parse(
+        "coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[[latent]]\nname = 'damping'\nfeatures = ['x']\n"
+        "kernel = '" +
+            kernel + "'\ndirections = { force = [['" + direction + "']] }\npositive = true\n",
+        "cart");
+    FitProblemOptions options;
+    options.noise_stddev = 0.05;
+    FitOptions nothing;
+    nothing.max_iterations = 0;
+    return fit(make_fit_problem(model, CsvTable::parse(log, "log.csv"), options), nothing).posterior;
+  };
+  FitReport report;
+  report.iterations = 10;
+  const auto told = Contains(
+      "warning: the data push the positive latent 'damping' to 0: is the sign of its direction wrong, or does nothing act along "
+      "it?");
+  EXPECT_THAT(notes_of(report, fit_along("0.2*dx", "constant", 0)), told);
+  EXPECT_THAT(notes_of(report, fit_along("-dx", "se", 8)), Not(told)) << "nearly 0 in half of its range";
+  EXPECT_THAT(notes_of(report, fit_along("-100*dx", "se", 8)), Not(told)) << "small beside its direction";
+}
+
+TEST(FitNotes, SpeakOfALoadWhereALatentReadsOne) {
+  const auto notes = [](const Model& model) {
+    const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0,3,0,-5,0\n2,0,4,0,-6,0\n3,0,5,0,-7,0\n", "log.csv");
+    FitProblemOptions options;
+    options.noise_stddev = 0.1;
+    options.mean = Prior::Mean::force;
+    FitOptions nothing;
+    nothing.max_iterations = 0;
+    FitReport report;
+    report.iterations = 10;
+    report.termination = FitReport::unsettled;
+    return notes_of(report, fit(make_fit_problem(model, log, options), nothing).posterior);
+  };
+  const auto told = Contains(HasSubstr("the fit has not converged: "));
+  const auto of_load = Contains(HasSubstr("may determine only the product of a load and its coefficient"));
+  EXPECT_THAT(notes(sled("lambda0(1)")), AllOf(told, of_load));
+  EXPECT_THAT(notes(constrained_cart("")), AllOf(told, Not(of_load)));
 }
 
 TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
@@ -185,6 +283,11 @@ TEST(FitNotes, TellOfRowsThatDryFrictionHolds) {
   };
   EXPECT_THAT(notes_and_findings(model_of("sign(dx)"), at_rest), told("dx"));
   EXPECT_THAT(notes_and_findings(model_of("dx/sqrt(dx^2 + dy^2)"), at_rest), told("dx, dy"));
+  const Model dry = model_of("sign(dx)");
+  const CsvTable test = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n" + at_rest, "test.csv");
+  const View view = View::constrained_acceleration(*dry.system);
+  EXPECT_THAT(read_log_states(make_prior(dry), view, dry, test, {}, {"ddx", "ddy"}).notes,
+              Contains(StartsWith("warning: test.csv: 3 of 5 rows are at rest where dry friction jumps")));
   // neither where a motion turns, nor where friction does not jump
   const auto silent = testing::Not(Contains(HasSubstr("at rest")));
   EXPECT_THAT(notes_and_findings(model_of("sign(dx)"), "3,3,0,0,0.01,0\n3.5,3,0,0,-2,0\n3.25,3,0,1,-2,0\n"), silent);
@@ -343,9 +446,11 @@ TEST(FitNotes, TellWhereResidualsThatLastAreMoreThanNoise) {
   TrainingResidual one = residual_of(200, 1.1, 0.94);
   one.output = "ddy";
   one.serial_correlation = 0.75;
+  one.n_serial = one.n;
   one.rms_in_noise = 1.2;
   EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("an effect that lasts longer than a sample")));
   EXPECT_FALSE(last_beyond_noise({one}));
+  EXPECT_EQ(correlated_text({one, one}), correlated_text({one})) << "of two short logs, which tell together";
   one.rms_in_noise = 3.9;
   EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("3.9 times the noise: a mass, a length")));
   EXPECT_TRUE(last_beyond_noise({one}));

@@ -96,6 +96,18 @@ TEST(InducingFit, TellsWhatIsLeftOutAndItsFileGivesItAgain) {
   EXPECT_EQ(again.posterior.mean(view, states), outcome.posterior.mean(view, states));
 }
 
+TEST(InducingFit, OfFewRowsSaysThatItStartsOnce) {
+  for (const int restarts : {1, 3}) {
+    FitRequest request = request_of_rows(50);
+    request.inducing = 20;
+    request.restarts = restarts;
+    request.max_iterations = 3;
+    const std::vector<std::string> notes = run_fit(prepare_fit(std::move(request))).notes;
+    const auto says_so = Contains(HasSubstr("`restarts` are not used; exact (`inducing=none`) they are"));
+    EXPECT_EQ(testing::Value(notes, says_so), restarts > 1);
+  }
+}
+
 TEST(InducingFit, ItsCheckpointIsTheBestSoFarOfAllRows) {
   const test::TemporaryFolder folder;
   FitRequest request = request_of_rows(1200);

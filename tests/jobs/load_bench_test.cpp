@@ -125,5 +125,45 @@ TEST(FrictionOfALoadAsACurve, IsItsCoefficient) {
   EXPECT_LT(curve->stddev.maxCoeff(), 0.05);
 }
 
+// A rod that is dragged: its friction changes the load that it is the coefficient of, by more where the rod is steeper.
+TEST(FrictionOfALoadAsACurve, HasOneBandWhereItIsOneNumberHoweverTheLoadDependsOnIt) {
+  const Model rod = Model::parse(
+      R"x(coordinates = ["x", "y", "th"]
+inputs = ["u"]
+[let]
+friction = "abs(lambda(1))*sign(dx + 0.5*sin(th)*dth)"
+[mechanics]
+mass = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "0.08"]]
+force = ["u", "-9.81", "0"]
+[constraints]
+position = ["y - 0.5*sin(th)"]
+[[latent]]
+name = "coefficient"
+kernel = "se"
+features = ["th"]
+lengthscale = { value = 1000, estimate = false }
+signal_stddev = { value = 2, estimate = false }
+directions = { force = [["-friction"], ["0"], ["-friction*0.5*sin(th)"]] }
+[noise]
+ddq = 0.5
+[truth]
+force = ["-0.5*friction", "0", "-0.25*friction*sin(th)"]
+[sampling]
+th = [0.8, 1.2]
+dth = [-1, 1]
+dx = [1, 3]
+u = [-1, 1]
+)x",
+      "rod.toml");
+  FitRequest request = test::fit_request(rod, {test::drawn_log(rod, 20, 1).table()});
+  request.restarts = 1;
+  const std::vector<LearnedForce> all = learned_forces(run_fit(prepare_fit(std::move(request))).posterior);
+  const auto curve = std::ranges::find_if(
+      all, [](const LearnedForce& one) { return one.names == std::vector<std::string>{"coefficient"} && one.along == "th"; });
+  ASSERT_NE(curve, all.end());
+  EXPECT_NEAR(curve->mean.mean(), 0.5, 4 * curve->stddev.mean());
+  EXPECT_LT(curve->stddev.maxCoeff(), 1.01 * curve->stddev.minCoeff());
+}
+
 }  // namespace
 }  // namespace gp2

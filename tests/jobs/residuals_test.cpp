@@ -1,5 +1,6 @@
 // Data that deny the model are not believed without a word, and data that do not are.
 #include <map>
+#include <numeric>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -121,8 +122,9 @@ struct LastingErrors {
       if (i >= 0) data.accelerations.col(i) = truth.col(i) + error;
     }
   }
-  [[nodiscard]] FitOutcome fit(bool thin) const {
-    FitRequest request = fit_request(*data.model, {data.table()});
+  [[nodiscard]] FitOutcome fit(bool thin) const { return fit(data.table(), thin); }
+  [[nodiscard]] FitOutcome fit(CsvTable table, bool thin) const {
+    FitRequest request = fit_request(*data.model, {std::move(table)});
     request.problem.noise_stddev = noise;
     request.problem.estimate = std::vector<std::string>();
     request.thin = thin;
@@ -152,6 +154,53 @@ TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
   const FitOutcome again = run_fit(prepare_fit_again(fewer.file));
   EXPECT_EQ(n_rows(again), n_rows(fewer));
   EXPECT_EQ(again.file.report.objective, fewer.file.report.objective);
+}
+
+TEST(Residuals, OfAShuffledLogAreTakenInTheOrderOfItsTime) {
+  const LastingErrors log(300, 0.9);
+  const FitOutcome ordered = log.fit(true), shuffled = log.fit(log.data.table().take(RandomStream(3).permutation(300)), true);
+  EXPECT_EQ(n_rows(shuffled), n_rows(ordered));
+  // but for t, which is not read
+  const auto motion_of = [](const FitOutcome& outcome) -> MatrixXd {
+    return outcome.posterior.observations().front().states().topRows(12);
+  };
+  EXPECT_EQ(motion_of(shuffled), motion_of(ordered));
+}
+
+// rows chosen at random stay in the order of the log, so that it shows that they share their errors
+TEST(Residuals, OfRowsChosenAtRandomAreTakenInTheOrderOfTheLog) {
+  const LastingErrors log(300, 0.95);
+  FitRequest request = fit_request(*log.data.model, {log.data.table()});
+  request.problem.noise_stddev = LastingErrors::noise;
+  request.problem.estimate = std::vector<std::string>();
+  request.problem.max_points = 200;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr("residuals are correlated from row to row")));
+  EXPECT_TRUE(outcome.cross_validation->stretches.has_value());
+}
+
+// One motion in twelve files is worth as many rows as in one.
+TEST(Residuals, OfManyShortLogsAreTakenTogether) {
+  const LastingErrors lasting(300, 0.9);
+  const CsvTable whole = lasting.data.table();
+  FitRequest request = fit_request(*lasting.data.model, {});
+  for (int first = 0; first < 300; first += 25) {
+    std::vector<int> rows(25);
+    std::iota(rows.begin(), rows.end(), first);
+    request.logs.push_back({whole.take(rows), nullptr});
+  }
+  request.problem.noise_stddev = LastingErrors::noise;
+  request.problem.estimate = std::vector<std::string>();
+  request.thin = false;
+  const FitOutcome all = run_fit(prepare_fit(request));
+  EXPECT_EQ(all.posterior.n_states(), 300);
+  EXPECT_THAT(all.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals are correlated from row to row"),
+                                                 testing::EndsWith(": standard deviations are too small"))));
+  request.thin = true;
+  const FitOutcome fewer = run_fit(prepare_fit(std::move(request)));
+  EXPECT_LE(fewer.posterior.n_states(), 100);
+  EXPECT_GE(fewer.posterior.n_states(), 36);
+  EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted to {} of 300, evenly spaced", fewer.posterior.n_states()))));
 }
 
 TEST(Residuals, ThatDenyAConstraintAreNotThinned) {

@@ -104,6 +104,66 @@ TEST(UpdateJob, AWindowLeavesTheNewest) {
   EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(8));
 }
 
+// All of these rows together would not fit into memory.
+TEST(UpdateJob, AWindowLearnsNoRowsThatItLeavesBehind) {
+  const FitFile fit = fit_of(log_of(30, 1));
+  const CsvTable log = log_of(20'000, 2);
+  UpdateRequest request;
+  request.window = 20;
+  const UpdateOutcome updated = update(fit, {log_of(5, 3), log}, request);
+  EXPECT_EQ(updated.n_added, 20'005);
+  EXPECT_EQ(updated.n_states, 20);
+  ASSERT_EQ(updated.fit.observations.size(), 1U);
+  EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(20));
+}
+
+TEST(UpdateJob, MoreRowsThanMemoryHoldsAreRefusedWithThoseThatFit) {
+  const FitFile fit = fit_of(log_of(30, 1));
+  const Posterior posterior = fit.posterior();
+  const Observations more = more_of(fit, log_of(4000, 2));
+  const auto refused = [&](std::optional<double> free, bool is_given) {
+    return input_error_of([&] {
+      require_memory_of_more(
+          posterior, more, "more.csv", [&] { return free; }, [&](double, int) { return is_given; });
+    });
+  };
+  EXPECT_EQ(refused(1e12, true), "");
+  EXPECT_EQ(refused(std::nullopt, true), "");
+  const std::string text = refused(2e8, true);
+  EXPECT_THAT(text, testing::StartsWith("more.csv: an exact fit of 4030 rows takes "));
+  EXPECT_THAT(text, HasSubstr(" GB more memory, of which 0.2 GB are free; the newest "));
+  EXPECT_THAT(text, HasSubstr(" rows would fit: keep these with `window="));
+  EXPECT_THAT(text, testing::EndsWith(", or fit all logs, through inducing points"));
+  EXPECT_THAT(refused(1e12, false), HasSubstr(" GB more memory in one piece, which the system does not give"));
+}
+
+// A stream of rows, some without a value of one column.
+TEST(UpdateJob, ARowMayLackAValueOfAColumn) {
+  const FitFile fit = fit_of(log_of(30, 1));
+  const CsvTable sound = log_of(1, 2);
+  const auto without = [&](const std::vector<std::string>& empty) {
+    std::string header, row;
+    for (const std::string& name : sound.header()) {
+      const double value = sound.number_or_empty(0, sound.find(name));
+      header += (header.empty() ? "" : ",") + name;
+      row += (&name == &sound.header().front() ? "" : ",");
+      row += std::isnan(value) || std::ranges::count(empty, name) > 0 ? "" : fmt::format("{}", value);
+    }
+    return CsvTable::parse(header + "\n" + row + "\n", "row.csv");
+  };
+  const Eigen::VectorXd all = more_of(fit, sound).values().col(0), some = more_of(fit, without({"ddq2"})).values().col(0);
+  ASSERT_EQ(some.size(), 3);
+  EXPECT_EQ(some[0], all[0]);
+  EXPECT_TRUE(std::isnan(some[1]));
+  EXPECT_EQ(some[2], all[2]);
+  const UpdateOutcome updated = update(fit, {without({"ddq2"})}, {});
+  EXPECT_EQ(updated.n_states, 31);
+  EXPECT_THAT(updated.notes, testing::Not(Contains(HasSubstr("ddq2"))));
+  const UpdateOutcome nothing = update(fit, {without({"ddq1", "ddq2", "ddq3"})}, {});
+  EXPECT_EQ(nothing.n_states, 30);
+  EXPECT_THAT(nothing.notes, Contains(HasSubstr("warning: row.csv: nothing is learned from it")));
+}
+
 // the file of a fit numbers its states anew, log after log
 TEST(UpdateJob, AWindowLeavesTheNewestOfSeveralLogsToo) {
   FitRequest request = test::fit_request(test::model(surface), {log_of(10, 1), log_of(12, 2)});
@@ -370,11 +430,23 @@ TEST(UpdateJob, RowsFarFromAllInducingPointsAreSaid) {
   request.thin = false;
   const FitFile fit = run_fit(prepare_fit(std::move(request))).file;
   ASSERT_TRUE(fit.report.inducing);
-  const auto is_said = [](const UpdateOutcome& outcome) {
-    return testing::Matches(Contains(HasSubstr("the fit's inducing points lose about")))(outcome.notes);
+  const auto is_said = [](const UpdateOutcome& outcome, const std::string& why) {
+    return testing::Matches(Contains(testing::AllOf(HasSubstr("the fit's inducing points lose about"), HasSubstr(why))))(
+        outcome.notes);
   };
-  EXPECT_FALSE(is_said(update(fit, {block_log("near.csv", 50, -0.97, "")}, {})));
-  EXPECT_TRUE(is_said(update(fit, {block_log("far.csv", 50, 40, "")}, {})));
+  const CsvTable near = block_log("near.csv", 50, -0.97, "");
+  EXPECT_FALSE(is_said(update(fit, {near}, {}), ""));
+  EXPECT_TRUE(
+      is_said(update(fit, {block_log("far.csv", 50, 40, "")}, {}), "of its rows, which lie far from those learned before;"));
+  UpdateRequest precise;
+  precise.noise_stddev = 0.00005;
+  EXPECT_TRUE(is_said(update(fit, {near}, precise), "of its rows, since their noise is much smaller than that of the fit"));
+  // what they stand for has no rows that could go
+  UpdateRequest newest;
+  newest.window = 5000;
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(update(fit, {near}, newest)); }),
+            "`window`: what was learned through inducing points cannot be taken away, since the observations themselves are not "
+            "kept; `forget` discounts it");
   // rows with deviations of their own are a group of their own
   const UpdateOutcome grown = update(fit, {block_log("stated.csv", 5, -1, "0.02"), block_log("one.csv", 1, -1, "0.02")}, {});
   EXPECT_EQ(grown.n_states, 1200 + 4 + 1);

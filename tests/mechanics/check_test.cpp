@@ -121,6 +121,21 @@ TEST(Check, CoriolisForcesThatAreMissingAreFoundBesideFriction) {
   EXPECT_FALSE(is_told("force = ['k*sin(b - a)*db^2 - 0.1*da', '-k*sin(b - a)*da^2']"));
 }
 
+TEST(Check, AMassThatTimeAloneChangesNeedsNoCoriolisForces) {
+  const auto is_told = [](const std::string& mass) {
+    const Model model =
+        Model::parse("coordinates = ['a', 'b']\n[mechanics]\nmass = [['" + mass + "', '0'], ['0', '1']]\n", "sledge");
+    bool told = false;
+    for (const Finding& finding : check_system(*model.system, MatrixXd::Random(5, 20), model.system->parameter_values())) {
+      told = told || finding.text.find("centrifugal forces are missing") != std::string::npos;
+    }
+    return told;
+  };
+  EXPECT_FALSE(is_told("3 + 0.5*t"));
+  EXPECT_TRUE(is_told("3 + 0.5*t + 0.5*cos(b)"));
+  EXPECT_TRUE(is_told("3 + 0.5*t*cos(b)"));
+}
+
 TEST(Check, AWrongBIsFound) {
   const Model model = bead();
   CallableSystem::Definition wrong;

@@ -1,6 +1,8 @@
+#include <fmt/format.h>
 #include <gtest/gtest.h>
 
 #include "gp2/mechanics/symbolic_system.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 
 // A and b against the motion they come from.
@@ -60,6 +62,62 @@ TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
     }
   }
   EXPECT_GT(n_compared, 0);
+}
+
+// Measured states are off the constraints, where rows that follow from others on them do not.
+TEST(ConstraintRowsTest, RedundantOnesStaySoAtMeasuredStates) {
+  const System& system = *test::model("models/slider_crank.toml").system;
+  EXPECT_EQ(system.nc(), 3);
+  EXPECT_EQ(system.largest_rank(), 2);
+  const VectorXd parameters = system.parameter_values();
+  const MatrixXd exact = test::draw(test::model("models/slider_crank.toml"), 20, constraint_rows_seed).states;
+  const MechanicsBatch there = require_mechanics(system, exact, parameters);
+  for (const double error : {1e-9, 1e-6, 1e-3}) {
+    SCOPED_TRACE(error);
+    RandomStream random(constraint_rows_seed);
+    MatrixXd measured = exact;
+    for (double& entry : measured.topRows(6).reshaped()) entry += error * (2 * random.uniform() - 1);
+    const MechanicsBatch here = require_mechanics(system, measured, parameters);
+    for (std::size_t i = 0; i < there.projections.size(); ++i) {
+      EXPECT_EQ(here.projections[i].rank(), 2);
+      // lengths are 0.1 m and more, velocities below 10 rad/s
+      const MatrixXd &T = there.projections[i].T(), &moved = here.projections[i].T();
+      EXPECT_LE(test::largest(moved - T), 100 * error * (1 + test::largest(T)));
+      EXPECT_LE(test::largest(here.projections[i].Lb() - there.projections[i].Lb()),
+                1000 * error * (1 + test::largest(there.projections[i].Lb())));
+    }
+  }
+}
+
+TEST(ConstraintRowsTest, TheirLargestRankIsKnownWherePositionsDecideIt) {
+  const auto largest_rank = [](const std::string& constraints) {
+    return Model::parse(fmt::format(R"toml(
+name        = "pendulum"
+coordinates = ["x", "z", "a"]
+parameters  = {{ h = 0, l = 0.7 }}
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "0.1"]]
+force = ["0", "-9.81", "0"]
+[constraints]
+{}
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)toml",
+                                    constraints),
+                        "pendulum")
+        .system->largest_rank();
+  };
+  const std::string loop = "'x - 0.7*sin(a)', 'z + 0.7*cos(a)'", rod = ", 'x^2 + z^2 - 0.49'";
+  EXPECT_EQ(largest_rank("position = [" + loop + "]"), 2);
+  EXPECT_EQ(largest_rank("position = [" + loop + rod + "]"), 2);
+  EXPECT_EQ(largest_rank("position = ['x - sin(t)', '2*x - 2*sin(t)']"), 1);
+  EXPECT_EQ(largest_rank("position = ['x - l*sin(a)', 'z + l*cos(a)', 'x^2 + z^2 - l^2']"), 2);
+  EXPECT_EQ(largest_rank("position = ['z - h*x^2', 'z - h*a']"), 2) << "where h is not 0";
+  EXPECT_EQ(largest_rank("position = ['x - t', 'x - 2*t']"), 2) << "they contradict each other";
+  EXPECT_EQ(largest_rank("position = [" + loop + rod + "]\nvelocity = ['dx + dz']"), 4) << "not of positions alone";
+  EXPECT_EQ(largest_rank("position = [" + loop + ", { expr = 'x^2 + z^2 - 0.49', when = 'x > 0' }]"), 3) << "not always there";
 }
 
 TEST(ConstraintRowsTest, AnAccelerationLevelConstraintIsTakenAsWritten) {

@@ -342,7 +342,7 @@ TEST(Discrepancy, FollowsTheParametersOfTheConstraintAndTheState) {
 TEST(Discrepancy, OfDeviationsThatHaveNoSquaresIsAnError) {
   const Eigen::RowVector2d A(1, 1);
   const auto of = [&](const Eigen::Vector2d& stddev) {
-    return MatrixXd(AdmissibleDirections().compute(A, MatrixXd(stddev.asDiagonal())));
+    return MatrixXd(AdmissibleDirections(static_cast<int>(A.rows())).compute(A, MatrixXd(stddev.asDiagonal())));
   };
   EXPECT_TRUE(of({1e-100, 1e-99}).allFinite());
   EXPECT_TRUE(of({1e100, 1e99}).allFinite());

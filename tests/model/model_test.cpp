@@ -489,6 +489,16 @@ std::vector<Complaint> complaints() {
        base + "[constraints]\nposition = [{ expr = \"q1\", name = \"wall\" }]\n"
               "[[latent]]\nfeatures = [\"lambda0(wal)\"]\n",
        "10: latent.features: lambda0(wal): there is no such row of the constraints, of which there are 1"},
+      {"LoadsOfTwoKindsInTheTruth",
+       base + "[constraints]\nposition = [\"q1\"]\n"
+              "[truth]\nforce = [\"lambda0(1)\", \"0\"]\nacceleration = [\"0\", \"lambda(1)\"]\n",
+       "11: truth.acceleration: both lambda0 and lambda are read: write lambda for both, the multipliers of the motion itself"},
+      {"LoadsOfTwoKindsInDirections",
+       base + "[constraints]\nposition = [\"q1\"]\n"
+              "[[latent]]\nfeatures = [\"q1\"]\ndirections = [[\"lambda0(1)\"],\n[\"lambda(1)\"]]\n",
+       "12: latent.directions: both lambda0 and lambda are read: write lambda for both, the multipliers of the motion itself"},
+      {"FeatureOfTheLoadOfTheMotion", base + "[constraints]\nposition = [\"q1\"]\n[[latent]]\nfeatures = [\"lambda(1)\"]\n",
+       "10: latent.features: lambda is what the latents make it, so that only directions and [truth] may read it; write lambda0"},
       {"NameOfARowTaken", base + "[constraints]\nposition = [{ expr = \"q1\", name = \"q2\" }]\n",
        "8: constraints.position entry 1.name: the name 'q2' is taken already; choose another"},
       {"NameOfTheLoad", base + "[let]\nlambda0 = \"1\"\n",
@@ -677,6 +687,20 @@ position     = ["x - y", { expr = "x", name = "wall" }]
 )toml",
                                    "named");
   EXPECT_EQ(model.expression("load"), model.expression("abs(lambda(2)) + lambda0(3)"));
+}
+
+TEST(Model, FeaturesMayReadTheKnownLoadAndDirectionsThatOfTheMotion) {
+  EXPECT_EQ(error_of(base + "[constraints]\nposition = [\"q1\"]\n"
+                            "[[latent]]\nfeatures = [\"lambda0(1)\"]\ndirections = [[\"lambda(1)\"], [\"0\"]]\n"
+                            "[truth]\nforce = [\"lambda0(1)\", \"0\"]\n"),
+            "");
+}
+
+TEST(Model, ARobotsDescriptionIsNoModel) {
+  for (const char* text : {"<robot name=\"r\"/>", "\xEF\xBB\xBF<?xml version=\"1.0\"?>\n<!-- 90° -->\n<mujoco/>"}) {
+    EXPECT_EQ(input_error_of([&] { Model::parse(text, "robots/arm.urdf"); }),
+              "robots/arm.urdf: not valid TOML but XML: name a robot's description in a model file, as robot = \"arm.urdf\"");
+  }
 }
 
 TEST(Model, BrokenTomlIsRefusedWithItsLine) {

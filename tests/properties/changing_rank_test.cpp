@@ -85,6 +85,28 @@ TEST(ChangingRankTest, ConstraintsOfOneRankAreNoteworthyToNobody) {
   EXPECT_THAT(make_fit_problem(constant, log_of(constant), {}).notes, testing::Not(Contains(HasSubstr("rank"))));
 }
 
+// A row that is switched off would not follow from others, but one that is switched on may.
+TEST(ChangingRankTest, RedundantRowsThatComeAndGoLowerNoRank) {
+  const std::string on_two_sides = R"-([{ expr = "z - y", when = "x > 3.5" }, { expr = "2*(z - y)", when = "x > 3.5" }])-";
+  const Model comes_and_goes = model_with("[]\nposition = " + on_two_sides);
+  const LowerRank none = states_of_lower_rank(*comes_and_goes.system, states(), VectorXd());
+  EXPECT_TRUE(none.states.empty());
+  EXPECT_EQ(none.usual, 1);
+  const std::vector<Finding> findings = check_system(*comes_and_goes.system, states(), VectorXd());
+  EXPECT_THAT(text_of(findings, Finding::Level::warning), testing::Not(HasSubstr("rank")));
+  EXPECT_THAT(text_of(findings, Finding::Level::good), HasSubstr("constraints: rank 1 of 2 rows: 1 redundant"));
+  EXPECT_THAT(make_fit_problem(comes_and_goes, log_of(comes_and_goes), {}).notes, testing::Not(Contains(HasSubstr("rank"))));
+
+  const Model lets_go_too = model_with("[\"x*(ddx - ddy)\"]\nposition = " + on_two_sides);
+  const LowerRank lower = states_of_lower_rank(*lets_go_too.system, states(), VectorXd());
+  EXPECT_EQ(lower.states, (std::vector<int>{2, 6}));
+  EXPECT_EQ(lower.usual - lower.lowest, 1);
+
+  // one state of its kind: what others with more rows have is a measure for it too
+  EXPECT_EQ(states_of_lower_rank({{2, {}}, {1, {1}}}).states, std::vector<int>{1});
+  EXPECT_TRUE(states_of_lower_rank({{1, {}}, {2, {1}}}).states.empty());
+}
+
 TEST(ChangingRankTest, RowsThatNearlyFollowFromEachOtherAreReported) {
   // the third row differs from the first by 1e-9 at one state, by much at others
   const Model nearly = model_with(R"-(["ddx - ddy", "ddx - ddy*(1 + 1e-9 + (x - 4)^2)"])-");

@@ -90,7 +90,7 @@ def test_the_distance_from_the_data_is_that_of_the_predictor(posterior, arm_stat
     predictor = gp2.Predictor(posterior)
     np.testing.assert_allclose([predictor.distance_from_data(x) for x in arm_states], distance, rtol=1e-12)
     assert (posterior.predict(100 * arm_states).distance_from_data > gp2.FAR_FROM_DATA).all()
-    with pytest.raises(gp2.InputError, match="a number that is read, or what the model makes of it, is not finite"):
+    with pytest.raises(gp2.InputError, match="^state: shoulder is nan, elbow is nan, .*; what is read must be finite"):
         predictor.distance_from_data(np.full(arm_states.shape[1], np.nan))
 
 
@@ -249,11 +249,26 @@ def test_the_predictor_takes_one_state(posterior, arm_states):
     refuses(lambda: predictor.mean(arm_states), gp2.InputError, "state: expected shape (7,), got (7, 7)")
     refuses(lambda: predictor.mean(arm_states[0, :3]), gp2.InputError, "state: expected shape (7,), got (3,)")
     refuses(lambda: predictor.mean(arm_states[0] * 1j), TypeError, "state: expected an array of real numbers")
-    refuses(lambda: predictor.mean(np.full(7, np.nan)), gp2.InputError, "state: a number that is read")
+    refuses(lambda: predictor.mean(np.full(7, 1e300)), gp2.InputError, "state: a number that is read, or what the model makes of it")
     expected = predictor.mean(arm_states[0])
     for states in same_bits(arm_states).values():
         np.testing.assert_array_equal(predictor.mean(np.asarray(states)[0]), expected)
     np.testing.assert_array_equal(predictor.mean(arm_states[0].tolist()), expected)
+
+
+def test_the_entry_of_a_state_that_is_missing_is_named(posterior, arm, arm_states):
+    state = dict(zip(arm.state_names, arm_states[0])) | {"elbow": np.inf}
+    del state["delbow"]
+    solver = gp2.InverseDynamicsSolver(posterior)
+    for call in (lambda: gp2.Predictor(posterior).mean(state), lambda: solver.inputs(state, np.zeros(2))):
+        refuses(call, gp2.InputError, "state: elbow is inf, delbow is nan; what is read must be finite")
+    refuses(
+        lambda: solver.inputs(arm_states[0], {"ddelbow": 1.0}), gp2.InputError,
+        "accelerations: ddshoulder is nan; what is read must be finite",
+    )  # fmt: skip
+    del state["tau1"], state["tau2"]
+    state |= dict(zip(("elbow", "delbow"), arm_states[0][[1, 3]]))
+    assert np.isfinite(solver.inputs(state, np.zeros(2))).all()  # the search begins at 0
 
 
 def test_data_as_arrays_leave_out_what_is_not_measured(arm, arm_log):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import gp2
+from conftest import columns_of
 
 
 def test_posterior_survives_a_pickle_to_the_bit(posterior, arm_states):
@@ -33,9 +34,23 @@ def test_a_posterior_without_data_is_copied_but_not_saved(posterior, arm_states,
 
 
 def test_what_never_changes_is_its_own_copy_and_a_system_travels_as_text(arm, arm_log):
-    for fixed in (arm, arm_log, gp2.Log(arm_log, arm), gp2.SideInformation("unconstrained", arm_log)):
+    for fixed in (arm, arm_log):
         assert copy.copy(fixed) is fixed and copy.deepcopy([fixed])[0] is fixed
     assert pickle.loads(pickle.dumps(arm)).text == arm.text
+
+
+def test_a_deep_copy_of_a_log_keeps_its_data_when_those_of_the_other_change(arm, arm_log):
+    log, free = columns_of(arm_log), {name: arm_log[name][:3].copy() for name in arm.state_names}
+    free |= {name: np.zeros(3) for name in ("abar_shoulder", "abar_elbow")}
+
+    def fitted(log, also):
+        return gp2.fit(arm, log, also=also, also_noise_std=0.1, max_iterations=0).negative_log_likelihood
+
+    given = gp2.Log(log, arm), gp2.SideInformation("unconstrained", free)
+    shallow, deep, before = tuple(map(copy.copy, given)), copy.deepcopy(given), fitted(*given)
+    log["ddelbow"] += 1
+    free["abar_elbow"] += 1
+    assert fitted(*deep) == before != fitted(*shallow) == fitted(*given)
 
 
 def test_tables_survive_a_pickle_with_gaps_and_text():

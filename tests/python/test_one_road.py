@@ -38,7 +38,7 @@ def test_check_has_the_findings_of_the_command(tmp_path, command, arm, arm_log):
 def test_show_is_what_the_command_prints(command, options):
     model = MODELS / "unicycle.toml"
     flags = [f"--{name}" for name in options]
-    assert gp2.show(gp2.System.load(model), **options) == command("show", model, *flags).stdout
+    assert gp2.show(gp2.System.load(model), **options) == gp2.show(model, **options) == command("show", model, *flags).stdout
 
 
 def test_check_without_data_or_sampling_says_so():
@@ -87,7 +87,7 @@ def test_show_of_a_fit_is_what_the_command_prints(command, arm, arm_log, tmp_pat
     posterior.save(tmp_path / "fit.json")
     shown = command("show", tmp_path / "fit.json").stdout
     assert shown.startswith("learned from ") and "negative log likelihood" in shown and "mass matrix M" in shown
-    assert gp2.show(gp2.load(tmp_path / "fit.json")) == shown
+    assert gp2.show(gp2.load(tmp_path / "fit.json")) == gp2.show(tmp_path / "fit.json") == shown
     assert gp2.show(posterior).splitlines()[0] == shown.splitlines()[0]
     told = json.loads(command("show", tmp_path / "fit.json", "--json").stdout)
     assert told["fit"]["states"] == posterior.n_data and told["coordinates"] == arm.coordinates

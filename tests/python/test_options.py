@@ -49,6 +49,54 @@ def test_arguments_that_are_something_else_are_named(arm, arm_log, posterior, ar
             call()
 
 
+def test_a_call_with_more_than_it_takes_says_how_it_is_written(arm, arm_log, posterior, arm_states):
+    rest = "by position; write what follows with its name: "
+    for call, said in {
+        lambda: posterior.predict(arm_states, "force", arm): f"predict() takes states, view {rest}system=…, latent=…, dt=…, mean_only=…",
+        lambda: gp2.Predictor(posterior, "force", arm): f"Predictor() takes posterior, view {rest}system=…, latent=…",
+        lambda: gp2.derive(arm, arm_log, None, 3): f"derive() takes system, data, like {rest}help() lists them",
+        lambda: gp2.check(arm, arm_log, None, 3): "check() takes no more than system, data, columns",
+        lambda: gp2.blas_report(3): "blas_report() takes no arguments",
+        lambda: posterior.cross_validate(3): "cross_validate() takes no arguments",
+        lambda: gp2.System("wire.toml"): "System() takes keywords; gp2.System.load reads a model file",
+        lambda: gp2.simulate(arm, {}, [0, 1], system=arm): "simulate() got the argument 'system' twice: by position and by name",
+        lambda: posterior.sample(arm_states, 2, n_samples=2): "sample() got the argument 'n_samples' twice: by position and by name",
+    }.items():
+        with pytest.raises(TypeError) as caught:
+            call()
+        assert str(caught.value).startswith(said)
+
+
+def test_a_whole_number_that_is_too_large_is_told_so(arm, arm_log, posterior, arm_states):
+    start, times = {"shoulder": 0.9}, [0, 0.1]
+    for call, said in {
+        lambda: posterior.sample(arm_states, seed=2**64): "seed: expected a whole number below 2^64, got 18446744073709551616",
+        lambda: posterior.simulate(start, times, n_samples=1, seed=2**64): "seed: expected a whole number below 2^64, got 184",
+        lambda: posterior.sample(arm_states, 2**31, seed=2**40): "n_samples: expected a whole number below 2^31, got 2147483648",
+        lambda: gp2.fit(arm, arm_log, restarts=2**31): "restarts: expected a whole number below 2^31, got 2147483648",
+        lambda: posterior.predict(arm_states, "next-velocity", dt=np.ones(2)): "dt: expected a number, got array([1., 1.])",
+    }.items():
+        with pytest.raises(TypeError) as caught:
+            call()
+        assert str(caught.value).startswith(said)
+
+
+def test_no_names_are_an_empty_list_where_the_command_says_none(arm, arm_log):
+    with pytest.raises(TypeError, match=r"^estimate: expected a list of names, \[\] for none, got 'none'$"):
+        gp2.fit(arm, arm_log, estimate="none")
+    with pytest.raises(gp2.InputError, match=r"^estimate: expected a list of names, \[\] for none, got \['none'\]$"):
+        gp2.fit(arm, arm_log, estimate=["none"])
+    assert "parameters to estimate; estimate=[]: none; default: those marked in the model" in gp2.fit.__doc__
+
+
+def test_what_is_no_fit_is_named(arm):
+    for call in (lambda: gp2.plot(arm), lambda: gp2.report(arm), lambda: gp2.report([arm])):
+        with pytest.raises(TypeError, match="^fit: expected a gp2.Posterior or the path of a FIT.json, got <gp2.System"):
+            call()
+    with pytest.raises(TypeError, match="^system: expected a gp2.System, a gp2.Posterior or the path of a file of one, got 3$"):
+        gp2.show(3)
+
+
 def test_a_truth_value_is_no_number_and_a_number_no_truth_value(arm, arm_log):
     for name, value, expected in [
         ("noise_std", True, "a positive number, 'estimate'"),

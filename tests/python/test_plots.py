@@ -87,7 +87,11 @@ def test_matplotlib_draws_predictions_and_calibration(posterior, arm, arm_log):
     assert [one.get_xlabel() for one in axes] == ["measured ddshoulder", "measured ddelbow"]
     drawn = axes[0].lines[0].get_xydata()
     np.testing.assert_allclose(drawn[:, 0], test["ddshoulder"])
-    np.testing.assert_allclose(drawn[:, 1], posterior.predict(test).mean[:, 0])
+    predicted = posterior.predict(test)
+    np.testing.assert_allclose(drawn[:, 1], predicted.mean[:, 0])
+    (bars,) = axes[0].collections
+    half = [np.ptp(segment[:, 1]) / 2 for segment in bars.get_segments()]
+    assert (half > 1.96 * predicted.std[:, 0]).all(), "with the noise of a measurement, as the coverage counts it"
     below = pyplot.subplots(2, 1, squeeze=False)[1]
     assert list(posterior.plot_predictions(test, ax=below)) == list(below[:, 0])
     line = posterior.plot_calibration(test).lines[-1]

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,3 +62,12 @@ def test_copies_and_pickles_need_no_file(pendulum, tmp_path):
     (tmp_path / "pendulum.xml").unlink()
     for other in (copy.deepcopy(pendulum), pickle.loads(pickle.dumps(pendulum))):
         assert np.array_equal(other.evaluate(states).F, pendulum.evaluate(states).F)
+
+
+def test_an_export_leaves_the_robots_own_file_alone(pendulum, tmp_path):
+    posterior = gp2.fit(pendulum, pendulum.generate(30, seed=3), mean="force", restarts=1, max_iterations=0)
+    with pytest.raises(gp2.InputError, match="pendulum.xml is the robot's own file, which would be lost"):
+        posterior.export(tmp_path, to="mjcf", name="pendulum", robot=str(tmp_path / "pendulum.xml"))
+    assert (tmp_path / "pendulum.xml").read_text() == PENDULUM
+    (written,) = posterior.export(tmp_path, to="mjcf", name="fitted", robot=str(tmp_path / "pendulum.xml"))
+    assert 'mass="3"' in Path(written).read_text()

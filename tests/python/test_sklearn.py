@@ -171,9 +171,38 @@ def test_a_series_is_the_acceleration_that_it_is_called(data):
     flat = GP2Regressor(WIRE, max_iterations=0).fit(X, ddz)
     assert flat.outputs_ == ["ddz"]
     assert np.array_equal(flat.predict(X[:4]), GP2Regressor(WIRE, observe="ddz", max_iterations=0).fit(X, y[:, 1]).predict(X[:4]))
-    assert flat.score(X, ddz) == flat.score(X, y[:, 1])
-    with pytest.raises(gp2.InputError, match="^y: no column ddx; it is ddz$"):
+    assert flat.score(X, ddz) == flat.score(X, y[:, 1]) == flat.score(X, ddz.rename("target"))
+    with pytest.raises(gp2.InputError, match="^y: no column ddx; it has: ddz$"):
         GP2Regressor(WIRE, observe="ddx").fit(X, ddz)
+    with pytest.raises(gp2.InputError, match="^y: no column ddz; it has: ddx$"):
+        flat.score(X, ddz.rename("ddx"))
+
+
+def test_what_is_masked_is_missing_in_fit_and_in_score(data, model):
+    X, y = data
+    masked = np.ma.array(y, mask=np.zeros(y.shape, bool))
+    assert model.score(X, masked) == model.score(X, y)
+    masked[3, 0] = np.ma.masked
+    for use in (model.score, GP2Regressor(WIRE, max_iterations=0).fit):
+        with pytest.raises(ValueError, match="contains NaN"):
+            use(X, masked)
+
+
+def test_names_of_columns_are_text_unless_all_are_whole_numbers(data, model):
+    X, y = data
+    estimator = GP2Regressor(WIRE, max_iterations=0)
+    for first, names in {
+        r"\('state', 'x'\)": pd.MultiIndex.from_tuples([("state", name) for name in WIRE.state_names]),
+        "b'x'": pd.Index([name.encode() for name in WIRE.state_names]),
+        "1": pd.Index(["x", 1, 2, 3, 4, 5]),
+    }.items():
+        for use in (model.predict, lambda X: estimator.fit(X, y)):
+            with pytest.raises(gp2.InputError, match=f"^X: column names must be text, got {first}$"):
+                use(pd.DataFrame(X, columns=names))
+    accelerations = pd.DataFrame(y, columns=[b"ddx", b"ddz"])
+    for use in (model.score, estimator.fit):
+        with pytest.raises(gp2.InputError, match="^y: column names must be text, got b'ddx'$"):
+            use(X, accelerations)
 
 
 def test_frames_are_read_by_their_names(data, model):
@@ -323,13 +352,13 @@ def test_options_reach_the_fit(data):
 def test_every_option_of_fit_reaches_it(data):
     X, y = data
     options = {"hyperparameters": "optimise", "robust": True, "restarts": 2}
-    with pytest.raises(gp2.InputError, match="fit_options: 'restarts' is an argument of GP2Regressor itself"):
+    with pytest.raises(gp2.InputError, match="fit_options: 'restarts' is the argument n_restarts of GP2Regressor itself"):
         GP2Regressor(WIRE, fit_options=options).fit(X, y)
     del options["restarts"]
     model = GP2Regressor(WIRE, mean="force", n_restarts=1, fit_options=options)
     assert clone(model).get_params()["fit_options"] == options
     also = {"also": [gp2.SideInformation("unconstrained", gp2.Table({"x": [0.0]}))]}
-    assert clone(GP2Regressor(WIRE, fit_options=also)).get_params()["fit_options"] == also
+    assert type(clone(GP2Regressor(WIRE, fit_options=also)).get_params()["fit_options"]["also"][0]) is gp2.SideInformation
     asked = model.fit(X, y).posterior_.options
     assert asked["robust"] is True and asked["hyperparameters"] == "optimise"
     with pytest.raises(TypeError, match="did you mean 'robust'"):
@@ -376,6 +405,8 @@ def test_faults_of_the_user_are_told(data):
         GP2Regressor(WIRE).fit(X, y[:, 0])
     with pytest.raises(gp2.InputError, match="^observe: ddw: no acceleration of 'bead on a wire': ddx, ddz"):
         GP2Regressor(WIRE, observe=["ddw"]).fit(X, y[:, 0])
+    with pytest.raises(gp2.InputError, match="^observe: goes with a system$"):
+        GP2Regressor(observe="ddx").fit(X, y[:, 0])
     with pytest.raises(gp2.InputError, match="^y: a, b: no acceleration of 'bead on a wire': ddx, ddz"):
         GP2Regressor(WIRE).fit(X, pd.DataFrame(y, columns=["a", "b"]))
     with pytest.raises(gp2.InputError, match="^y: no column ddx; it has: ddz"):

@@ -1,6 +1,7 @@
 """Logs go by the names of their columns: paths, tables, pandas frames, mappings."""
 
 import logging
+import pickle
 
 import numpy as np
 import pandas as pd
@@ -130,13 +131,42 @@ def test_a_table_has_its_own_name_or_the_one_that_is_given(tmp_path):
     columns = {"x": [1.0, 2.0], "said": ["yes", "no"], "mixed": ["1", "x"]}
     assert gp2.Table(columns).name == "data" and gp2.Table(columns, name="monday").name == "monday"
     assert gp2.Table(path).name == str(path)
-    for table, place in [(gp2.Table(path, name="monday"), 4), (gp2.Table(gp2.Table(columns), name="monday"), 3)]:
+    for table, place in [(gp2.Table(path, name="monday"), ":4: "), (gp2.Table(gp2.Table(columns), name="monday"), ": row 2, ")]:
         assert table.name == "monday" and list(table["x"]) == [1, 2]
         assert list(table["said"]) == ["yes", "no"]
-        with pytest.raises(gp2.InputError, match=f"^monday:{place}: column 'mixed': 'x' is not a finite number"):
+        with pytest.raises(gp2.InputError, match=f"^monday{place}column 'mixed': 'x' is not a finite number"):
             table["mixed"]
     assert list(gp2.Table({"touch": np.array([True, False])})["touch"]) == [1, 0]
     assert gp2.Table(gp2.Table(columns, name="monday")).name == "monday"
+
+
+def test_rows_of_what_is_no_file_are_counted_from_1(arm, frame, posterior):
+    frame.loc[3, "ddelbow"] = np.inf
+    for table in (frame, pickle.loads(pickle.dumps(gp2.Table(frame)))):
+        for call in (lambda: gp2.fit(arm, table), lambda: posterior.evaluate(table), lambda: gp2.Table(table)["ddelbow"]):
+            with pytest.raises(gp2.InputError, match="^data: row 4, column 'ddelbow': 'inf' is not a finite number$"):
+                call()
+
+
+@pytest.mark.parametrize(("change", "first"), [(lambda name: ("log", name), "('log', 'shoulder')"), (str.encode, "b'shoulder'")])
+def test_names_of_columns_are_text(change, first, arm, frame, posterior):
+    states, ddq = frame[arm.state_names], frame[arm.acceleration_names]
+    odd = frame.set_axis(pd.Index([change(name) for name in frame.columns], tupleize_cols=False), axis=1)
+    states = odd.iloc[:, : len(arm.state_names)]
+    for name, call in {
+        "data": lambda: gp2.fit(arm, odd),
+        "states": lambda: posterior.predict(odd),
+        "state": lambda: gp2.Predictor(posterior).mean(states.iloc[0]),
+    }.items():
+        with pytest.raises(gp2.InputError) as caught:
+            call()
+        assert str(caught.value) == f"{name}: column names must be text, got {first}"
+    with pytest.raises(gp2.InputError, match="^states: column names must be text"):
+        gp2.fit(arm, (states, ddq))
+    with pytest.raises(gp2.InputError, match="^data: column names must be text, got 3$"):
+        gp2.Table({"x": [1.0], 3: [2.0]})
+    numbered = frame[arm.state_names].set_axis(range(len(arm.state_names)), axis=1)  # are positions
+    np.testing.assert_array_equal(posterior.predict(numbered).mean, posterior.predict(frame).mean)
 
 
 def test_numbers_go_through_a_table_unchanged():
@@ -240,6 +270,25 @@ def test_an_empty_cell_of_an_acceleration_is_not_measured(gap, arm, arm_log, tmp
     assert fitted.evaluate(frame).n_missing == 1
     fitted.save(tmp_path / "fit.json")
     assert gp2.load(tmp_path / "fit.json").negative_log_likelihood == fitted.negative_log_likelihood
+
+
+def test_an_acceleration_that_is_measured_nowhere_is_not_compared(posterior, arm_log, caplog):
+    log = columns_of(arm_log)
+    log["ddelbow"][:] = np.nan
+    for compared in (
+        lambda: posterior.evaluate(log).outputs,
+        lambda: gp2._gp2._compared(posterior, log, None, None)["outputs"],
+        lambda: gp2.report(posterior, data=log) and ["ddshoulder"],
+    ):
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="gp2"):
+            assert compared() == ["ddshoulder"]
+        assert "data: not compared: ddelbow, which it lacks" in caplog.text
+    log["ddshoulder"][:] = np.nan
+    mend = "choose others with observe of a fit, outputs of an evaluation$"
+    for outputs in (None, ["ddelbow"]):
+        with pytest.raises(gp2.InputError, match="every cell is empty, so nothing is measured there; " + mend):
+            posterior.evaluate(log, outputs=outputs)
 
 
 def test_a_robust_fit_lists_what_it_distrusts(arm, arm_log):

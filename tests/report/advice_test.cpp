@@ -80,6 +80,20 @@ TEST(Advice, TellsThatTheOptimiserDidNotConverge) {
   report.fit.report.termination = "the limit of iterations was reached";
   EXPECT_THAT(learning_advice(report),
               ElementsAre(advises(Level::warning, "did not converge: the limit of iterations", "`max_iterations`")));
+  report.fit.report.termination = FitReport::interrupted;
+  EXPECT_THAT(learning_advice(report), ElementsAre(AllOf(advises(Level::warning, "did not converge: interrupted", "`start`"),
+                                                         Field(&Advice::mend, Not(HasSubstr("max_iterations"))))));
+}
+
+TEST(Advice, DoesNotBlameAnOptimiserWhoseRestartsAgree) {
+  Report report = good_report();
+  report.fit.report.converged = false;
+  report.fit.report.termination = "the line search could not lower the objective further";
+  report.fit.report.restarts[1].objective = 10.0005;
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::note, "stopped short of its tolerances: the line search", "2 of 3 restarts")));
+  report.fit.report.termination = FitReport::unsettled;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "did not converge", "")));
 }
 
 TEST(Advice, TellsThatNothingWasOptimisedAndThenSaysNothingOfRelevance) {
@@ -88,6 +102,11 @@ TEST(Advice, TellsThatNothingWasOptimisedAndThenSaysNothingOfRelevance) {
   report.fit.report.iterations = 0;
   report.relevance = {{"friction", "dq1", 1e6, 1, 1e-6, 1e-6}};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Nothing was optimised", "`max_iterations=0`")));
+  report.fit.report.termination = FitReport::interrupted;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Nothing was optimised", "without stopping it")));
+  // the best restart is the one that stayed where it began
+  report.fit.report.restarts[1].iterations = 5;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "did not converge", "`start`")));
 }
 
 TEST(Advice, TellsOfRestartsThatFailedOrDisagree) {
@@ -99,7 +118,17 @@ TEST(Advice, TellsOfRestartsThatFailedOrDisagree) {
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "No restart reached", "`restarts`")));
   report.fit.report.objective = 10;
   report.fit.report.restarts[1].objective = std::numeric_limits<double>::infinity();
+  report.fit.report.restarts[1].evaluations = 1;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "1 of 3 restarts found no finite start", "bounds")));
+  report.fit.report.restarts[1].evaluations = 0;  // as where the fit was interrupted
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "1 of 3 restarts were not begun", "`start`")));
+}
+
+TEST(Advice, SaysWhatIsWrongWithTheLogOfATest) {
+  Report report = good_report();
+  report.data = {good_data("training"), good_data("test")};
+  report.data[1].notes = {"warning: test.csv: dx is not the rate of x over t: it lags by 3 rows"};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "test.csv: dx is not the rate of x", "")));
 }
 
 TEST(Advice, SaysWhatTheFitSaid) {
@@ -141,6 +170,30 @@ TEST(Advice, ALengthscaleAtItsUpperBoundIsOnlyAnIrrelevantFeature) {
   EXPECT_THAT(learning_advice(report),
               UnorderedElementsAre(advises(Level::note, "lower bound: lengthscale(q1) (0.05)", "wiggles"),
                                    advises(Level::note, "q1 hardly matters", "")));
+}
+
+TEST(Advice, SaysNothingOfWigglesWhereAKernelIsLinear) {
+  const auto of_kernel = [](const std::string& kernel, int index, const std::string& name) {
+    Report report = good_report();
+    report.fit.model = Model::parse(
+        "coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[[latent]]\nkernel = '" + kernel + "'\nfeatures = ['x']\n",
+        "model.toml");
+    report.fit.report.hyperparameters = {hyperparameter(Hyperparameter::Kind::kernel, name, 0.05, 0.05, 1e6)};
+    report.fit.report.hyperparameters.front().index = index;
+    return learning_advice(report);
+  };
+  EXPECT_THAT(of_kernel("linear", 0, "lengthscale(x)"), ElementsAre(advises(Level::good, "", "")));
+  EXPECT_THAT(of_kernel("se", 0, "lengthscale(x)"), ElementsAre(advises(Level::note, "lower bound", "wiggles")));
+  EXPECT_THAT(of_kernel("se + linear", 1, "linear.lengthscale(x)"), ElementsAre(advises(Level::good, "", "")));
+  EXPECT_THAT(of_kernel("se + linear", 0, "se.lengthscale(x)"), ElementsAre(advises(Level::note, "lower bound", "wiggles")));
+}
+
+TEST(Advice, DoesNotSendToTheModelFileForTheBoundsOfABaseline) {
+  Report report = good_report();
+  report.fit.report.hyperparameters = {hyperparameter(Hyperparameter::Kind::signal_stddev, "signal_stddev(ddx)", 2, 1e-3, 2)};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "signal_stddev(ddx) (upper bound, 2)", "Widen")));
+  report.fit.prior_options.baseline = Baseline();
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "signal_stddev(ddx)", "of a baseline are fixed")));
 }
 
 TEST(Advice, TellsOfDataOffTheConstraintByHowFarTheyAre) {

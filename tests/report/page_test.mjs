@@ -16,6 +16,15 @@ const json = (name) => JSON.parse(readFileSync(join(folder, name), "utf8"));
 // what a person who wishes ill could call a model
 const hostile = `</script><img src=x onerror="document.title='broken'"><!-- {{data}} "quoted" & \\u003c`;
 
+/** A page whose data are changed. */
+function rewrite(from, to, change) {
+  const html = readFileSync(join(folder, from), "utf8");
+  const place = html.indexOf('id="report">') + 'id="report">'.length, end = html.indexOf("</script>", place);
+  const reports = JSON.parse(html.slice(place, end));
+  change(reports);
+  writeFileSync(join(folder, to), html.slice(0, place) + JSON.stringify(reports).replaceAll("<", "\\u003c") + html.slice(end));
+}
+
 let browser;
 
 before(async () => {
@@ -270,15 +279,57 @@ test("fits side by side are told apart by how far their motions are off", async 
   await close();
 });
 
+/** The last simulated values of a motion are gone, as where its simulation ended early. */
+function endAt(motion, n) {
+  motion.ended = "there is no more";
+  for (const values of [...motion.simulated, ...motion.stddev, motion.energy_simulated]) values.fill(null, n);
+}
+
+test("a motion that ends early is compared over the time that both go", async () => {
+  const file = join(models, "surface.toml"), n = 21;
+  gp2("simulate", file, "--start", "q1=0.4,q2=0.8,dq1=0.8,dq2=1", "--t-end", "2", "--dt", "0.05", "-o", "short.csv");
+  gp2("report", "surface.json", "--data", "short.csv", "-o", "whole.html");
+  gp2("report", "surface.json", "surface.json", "--data", "short.csv", "-o", "twice.html");
+  let motion;
+  rewrite("whole.html", "early.html", ([{ data: [, data] }]) => { motion = data.rollout; endAt(motion, n); });
+  rewrite("twice.html", "twice_early.html", ([, { data: [, data] }]) => endAt(data.rollout, n));
+  const one = await open("early.html");
+  const caption = await one.page.locator("#rollout-energy-charts .summary").first().textContent();
+  const [measured, simulated] = [...caption.matchAll(/ ([-\d.e]+) J as/g)].map((found) => Number(found[1]));
+  for (const [told, values] of [[measured, motion.energy], [simulated, motion.energy_simulated]]) {
+    const change = values[n - 1] - values[0];
+    assert.ok(Math.abs(told - change) <= 1e-2 * Math.abs(change) + 1e-9, caption);
+  }
+  await one.close();
+  const { page, close } = await open("twice_early.html");
+  const scores = await numbers(page, "comparison-scores");
+  const off = scores["simulated motion, rms error / range, until t = 1 s"];
+  assert.equal(off.length, 2, Object.keys(scores).join("; "));
+  assert.equal(off[0], off[1]);
+  await close();
+});
+
+test("the likelihood of the fit is not that of rows that came later, and a constraint says when it holds", async () => {
+  rewrite("surface.html", "changed.html", ([report]) => {
+    report.fit.rows_are_those_of_fit = false;
+    Object.assign(report.model.constraints[0], { when: "q1 < 2", contact: true });
+  });
+  const { page, close } = await open("changed.html");
+  assert.match(await page.locator("#tiles").textContent(), /at the fit; rows may have changed since/);
+  assert.match(await page.locator("#constraints table").textContent(), /holds.*a contact, while q1 < 2/);
+  await close();
+  const plain = await open("surface.html");
+  assert.match(await plain.page.locator("#tiles").textContent(), /of 100 rows/);
+  assert.doesNotMatch(await plain.page.locator("#constraints table").textContent(), /holds/);
+  await plain.close();
+});
+
 test("axes have ticks for a range of rounding errors, and for times since 1970", async () => {
-  const html = readFileSync(join(folder, "surface.html"), "utf8");
-  const place = html.indexOf('id="report">') + 'id="report">'.length, end = html.indexOf("</script>", place);
-  const reports = JSON.parse(html.slice(place, end));
-  const data = reports[0].data[1];
-  data.columns.t = data.predicted[0].map((_, i) => 1.7e9 + i);
-  data.predicted[0] = data.predicted[0].map(() => 100);
-  data.stddev[0] = data.stddev[0].map(() => 1e-14);
-  writeFileSync(join(folder, "narrow.html"), html.slice(0, place) + JSON.stringify(reports).replaceAll("<", "\\u003c") + html.slice(end));
+  rewrite("surface.html", "narrow.html", ([{ data: [, data] }]) => {
+    data.columns.t = data.predicted[0].map((_, i) => 1.7e9 + i);
+    data.predicted[0] = data.predicted[0].map(() => 100);
+    data.stddev[0] = data.stddev[0].map(() => 1e-14);
+  });
   const { page, close } = await open("narrow.html");
   for (const { title, count } of await inked(page)) assert.ok(count > 20, `${title}: ${count} pixels`);
   await page.locator("#constrained-chart .u-over").hover();

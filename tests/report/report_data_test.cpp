@@ -239,12 +239,105 @@ TEST_F(ReportOf, SaysWhatTheFitSaidAndOfAFileWithoutNotesWhatItsDataTell) {
   EXPECT_THAT(collect_report(file, posterior, {}, notes).notes, testing::Contains(HasSubstr("six or more standard deviations")));
   desk.done("gp2 update fit.json --data sound.csv -o more.json");
   EXPECT_FALSE(FitFile::read(desk / "more.json").notes) << "they are of the data that there were";
+  // and so is the likelihood
+  EXPECT_THAT(desk.done("gp2 show more.json").out, HasSubstr(", at the fit; rows may have changed since\n"));
+  EXPECT_THAT(desk.done("gp2 show fit.json").out, Not(HasSubstr("at the fit;")));
+  for (const auto& [name, is_of_these] : {std::pair("fit.json", true), std::pair("more.json", false)}) {
+    const Report report = collect_report(desk / name, {}, notes);
+    EXPECT_EQ(nlohmann::json::parse(report_json({report}, with_flags))[0]["fit"]["rows_are_those_of_fit"], is_of_these);
+  }
 }
 
 TEST_F(ReportOf, SeesThatComputedAccelerationsFollowFromEachOther) {
   const Report r = report("surface", "--noise-std 0", "--mean force --max-iterations 0", /*with_test=*/false);
   ASSERT_EQ(r.data.size(), 1u);
   EXPECT_EQ(r.data[0].independent.size(), 2u);
+}
+
+TEST_F(ReportOf, TakesTheDerivedAccelerationsOfARawLogForNoMeasurements) {
+  // positions alone, with the noise of an encoder
+  const auto noise = [](int i) { return 2e-4 * std::sin(37.0 * i * i); };
+  desk.done("gp2 simulate models/surface.toml --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 2 --dt 0.02 -o motion.csv");
+  const CsvTable motion = CsvTable::read(desk / "motion.csv");
+  std::string raw = "t,q1,q2,q3,u1,u2,u3\n";
+  for (int i = 0; i < motion.n_rows(); ++i) {
+    raw += motion.cell(i, motion.find("t"));
+    for (int j = 1; j <= 3; ++j)
+      raw += fmt::format(",{}", motion.number(i, motion.find(fmt::format("q{}", j))) + noise(3 * i + j));
+    for (const char* u : {"u1", "u2", "u3"}) raw += "," + std::string(motion.cell(i, motion.find(u)));
+    raw += "\n";
+  }
+  desk.write("raw.csv", raw);
+  desk.done("gp2 fit models/surface.toml --raw raw.csv --mean force --restarts 1 --max-iterations 3 -o raw.json");
+  std::vector<std::string> notes;
+  const Report report = collect_report(desk / "raw.json", {}, notes);
+  ASSERT_TRUE(report.fit.observations.front().has_sums());
+  EXPECT_THAT(report.data.front().independent, testing::IsEmpty());
+}
+
+// Two wheels that turn far, and a spring between them.
+std::string two_wheels(const std::string& features) {
+  return "coordinates = ['a', 'b']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n[[latent]]\nname = 'spring'\nkernel = 'se'\n"
+         "features = [" +
+         features + "]\ndirections = { force = [['-1'], ['1']] }\n[noise]\nddq = 0.1\n";
+}
+
+std::string two_wheels_log() {
+  std::string log = "a,b,da,db,dda,ddb\n";
+  for (int i = 0; i < 60; ++i) {
+    const double apart = std::sin(i), b = 0.5 * i, db = 10 * std::cos(0.7 * i);
+    log += fmt::format("{},{},{},{},{},{}\n", b + 0.3 * apart, b, db + 0.2 * std::cos(2 * i), db, -apart, apart);
+  }
+  return log;
+}
+
+TEST_F(ReportOf, AForceOfDifferencesIsDrawnAlongThemAndOnlyWhereTheDataAre) {
+  desk.write("wheels.toml", two_wheels("'a - b', 'da - db'"));
+  desk.write("train.csv", two_wheels_log());
+  desk.done("gp2 fit wheels.toml --data train.csv --restarts 1 --max-iterations 5 -o fit.json");
+  std::vector<std::string> notes;
+  const std::vector<LearnedForce> all = learned_forces(FitFile::read(desk / "fit.json").posterior(), &notes);
+  EXPECT_THAT(notes, testing::IsEmpty());
+  std::vector<std::string> along;
+  for (const LearnedForce& one : all) {
+    along.push_back(one.along);
+    const double low = one.data.minCoeff(), high = one.data.maxCoeff();
+    EXPECT_LT(high - low, 1) << "the marks are where the feature was";
+    EXPECT_EQ(one.data.size(), 60);
+    EXPECT_GE(one.at[0], low - 0.051 * (high - low));
+    EXPECT_LE(one.at[100], high + 0.051 * (high - low));
+    EXPECT_GT(one.at[100] - one.at[0], 0.9 * (high - low));
+    EXPECT_GT((one.at.tail(100) - one.at.head(100)).minCoeff(), 0) << "ascending";
+  }
+  EXPECT_THAT(along, testing::Contains("a - b"));
+  for (const char* entry : {"a", "b", "da", "db"}) EXPECT_THAT(along, Not(testing::Contains(entry)));
+  desk.done("gp2 plot fit.json --along 'a - b' -o spring.svg");
+  EXPECT_THAT(desk.run("gp2 plot fit.json --along a -o a.svg").err, HasSubstr("there are: a - b"));
+}
+
+TEST_F(ReportOf, WhereSeveralFeaturesLeaveTheDataNothingIsDrawnAndTheReportSaysSo) {
+  desk.write("wheels.toml", two_wheels("'a - b', 'a - 2*b'"));
+  desk.write("train.csv", two_wheels_log());
+  desk.done("gp2 fit wheels.toml --data train.csv --restarts 1 --max-iterations 5 -o fit.json");
+  std::vector<std::string> notes;
+  const Report report = collect_report(desk / "fit.json", {}, notes);
+  EXPECT_THAT(report.learned, testing::IsEmpty());
+  EXPECT_THAT(report.notes, testing::Contains(HasSubstr("what 'spring' has learned is not drawn along a, b: moved alone, they")));
+  EXPECT_THAT(desk.run("gp2 plot fit.json -o spring.svg").err, HasSubstr("nothing to plot: what 'spring' has learned"));
+}
+
+TEST_F(ReportOf, SaysWhenAConstraintHolds) {
+  desk.write("floor.toml",
+             "coordinates = ['x', 'z']\ninputs = ['touch']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n[constraints]\n"
+             "position = [{ expr = 'z', when = 'touch > 0.5' }]\n[[latent]]\nfeatures = ['dx']\n[noise]\nddq = 0.1\n");
+  std::string log = "x,z,dx,dz,touch,ddx\n";
+  for (int i = 0; i < 12; ++i) log += fmt::format("{},0,{},0,1,{}\n", 0.1 * i, std::sin(i), -std::sin(i));
+  desk.write("train.csv", log);
+  desk.done("gp2 fit floor.toml --data train.csv --observe ddx --max-iterations 0 -o fit.json");
+  std::vector<std::string> notes;
+  const auto json = nlohmann::json::parse(report_json({collect_report(desk / "fit.json", {}, notes)}, with_flags))[0];
+  EXPECT_EQ(json["model"]["constraints"][0]["when"], "touch > 0.5");
+  EXPECT_EQ(json["model"]["constraints"][0]["contact"], false);
 }
 
 TEST_F(ReportOf, ABaselineAndACoordinateThatIsNotReadHaveOneToo) {
@@ -355,6 +448,28 @@ TEST_F(RolloutOf, LearnedPotentialsKeepTheEnergyOfASimulatedMotion) {
   EXPECT_GT(motion.energy.maxCoeff() - motion.energy.minCoeff(), 1e-3 * exchanged) << "what was learned is not the truth";
 }
 
+TEST_F(RolloutOf, TimesInOtherUnitsAreConvertedAndVelocitiesInOtherUnitsMakeNoMotion) {
+  desk.write("mass.toml",
+             "coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[[latent]]\nkernel = 'se'\nfeatures = ['x', 'dx']\n[truth]\n"
+             "force = ['-4*x - 0.3*dx']\n[noise]\nddq = 0.05\n[sampling]\nx = [-1, 1]\ndx = [-2, 2]\n");
+  desk.done("gp2 generate mass.toml --n 40 -o train.csv");
+  desk.done("gp2 fit mass.toml --data train.csv --restarts 1 -o fit.json");
+  desk.done("gp2 simulate mass.toml --start x=0.8,dx=0 --t-end 4 --dt 0.05 -o test.csv");  // t, x, dx, ddx
+  desk.done("awk 'BEGIN { FS = OFS = \",\" } NR > 1 { $1 *= 1000 } 1' test.csv > milliseconds.csv");
+  desk.done("awk 'BEGIN { FS = OFS = \",\" } NR > 1 { $3 *= 57.29578 } 1' test.csv > degrees.csv");
+  const Rollout motion = of("test.csv"), in_milliseconds = of("milliseconds.csv");
+  ASSERT_EQ(motion.reason, "");
+  EXPECT_TRUE(in_milliseconds.times.isApprox(motion.times, 1e-12));
+  EXPECT_TRUE(in_milliseconds.simulated.isApprox(motion.simulated, 1e-6));
+  EXPECT_THAT(desk.done("gp2 report fit.json --data milliseconds.csv -o report.html").err,
+              HasSubstr("t counts 0.001 s, not seconds"));
+  EXPECT_THAT(of("degrees.csv").reason, testing::StartsWith("dx is not the rate of x over t: "));
+  for (const char* command : {"report fit.json -o report.html", "evaluate fit.json"})
+    EXPECT_THAT(desk.done(fmt::format("gp2 {} --data degrees.csv", command)).err,
+                HasSubstr("warning: degrees.csv: dx is not the rate of x over t"));
+  EXPECT_THAT(desk.done("gp2 evaluate fit.json --data test.csv").err, Not(HasSubstr("is not the rate")));
+}
+
 TEST_F(RolloutOf, WhatIsNoMotionSaysWhy) {
   fit_surface();
   desk.done("gp2 generate models/surface.toml --n 20 --seed 2 -o random.csv");
@@ -378,6 +493,7 @@ TEST_F(RolloutOf, AMotionThatRunsAwayIsDrawnAsFarAsItWent) {
   const Rollout motion = of("test.csv");
   EXPECT_EQ(motion.reason, "");
   EXPECT_NE(motion.ended, "");
+  EXPECT_THAT(motion.ended, Not(HasSubstr("max_steps"))) << "a report has no such option";
   EXPECT_EQ(motion.simulated(0, 0), 3);
   EXPECT_TRUE(std::isnan(motion.simulated(0, 39)));
 }

@@ -748,6 +748,48 @@ TEST(UrdfErrors, MassesMustBeNumbersNotNegative) {
                                     HasSubstr("Object name = arm"), EndsWith("give it <inertial> or a geom")));
 }
 
+TEST(UrdfErrors, NumbersAreNamedWithTheirLinkOrJoint) {
+  const auto with = [](const std::string& from, const std::string& to) {
+    std::string text = urdf(link("base") + link("arm") +
+                            joint("a", "revolute", "base", "arm", R"(<dynamics damping="0.5"/><limit lower="-1" upper="1"/>)"));
+    const std::size_t at = text.rfind(from);
+    EXPECT_NE(at, std::string::npos) << from;
+    return error_of(text.replace(at, from.size(), to), "r.urdf");
+  };
+  const std::string of_joint = "r.urdf: joint 'a': ", of_link = "r.urdf: link 'arm', <inertial>: ";
+  const std::string axis = R"(<axis xyz="0 1 0"/>)", mass = R"(<mass value="1"/>)";
+  EXPECT_EQ(with("0 1 0", "0,1,0"), of_joint + "xyz of its <axis> must be 3 numbers with spaces between, got '0,1,0'");
+  EXPECT_EQ(with("0 1 0", "0 1"), of_joint + "xyz of its <axis> must be 3 numbers with spaces between, got '0 1'");
+  EXPECT_EQ(with(axis, "<axis/>"), of_joint + "its <axis> has no xyz");
+  EXPECT_EQ(with(axis, axis + axis), of_joint + "its <axis> stands twice: remove one");
+  EXPECT_EQ(with("0 1.57079632679 0", "0 90deg 0"),
+            of_joint + "rpy of its <origin> must be 3 numbers with spaces between, got '0 90deg 0'");
+  EXPECT_EQ(with(R"("0.5")", R"("0,5")"), of_joint + "damping of its <dynamics> must be a number, got '0,5'");
+  EXPECT_EQ(with(R"("-1")", R"("-1rad")"), of_joint + "lower of its <limit> must be a number, got '-1rad'");
+  EXPECT_EQ(with("0 0 0.1", "0 0"), of_link + "xyz of its <origin> must be 3 numbers with spaces between, got '0 0'");
+  EXPECT_EQ(with(R"( izz="0.015")", ""), of_link + "its <inertia> has no izz");
+  EXPECT_EQ(with(R"(ixy="0")", R"(ixy="O")"), of_link + "ixy of its <inertia> must be a number, got 'O'");
+  EXPECT_EQ(with(mass, mass + mass), of_link + "its <mass> stands twice: remove one");
+  EXPECT_EQ(with("0 1 0", " +0 1. 0e0 "), "");
+
+  EXPECT_EQ(error_of(urdf(R"(<link name="a"><inertial><mass value="1"/></inertial></link>)")),
+            "robot.xml: link 'a': its <inertial> has no <inertia>");
+  const auto with_shape = [](const std::string& shape) {
+    return error_of(urdf(fmt::format(R"(<link name="a"><collision>{}</collision></link>)", shape)));
+  };
+  const std::string of_shape = "robot.xml: link 'a', <collision>: ";
+  EXPECT_EQ(with_shape(""), of_shape + "it has no <geometry>");
+  EXPECT_EQ(with_shape(R"(<geometry><sphere radius="0,1"/></geometry>)"),
+            of_shape + "radius of its <sphere> must be a number, got '0,1'");
+}
+
+TEST(UrdfErrors, AJointFloatsUnderTheWorld) {
+  EXPECT_THAT(
+      error_of(urdf(link("base") + link("arm") + joint("root", "floating", "base", "arm"))),
+      EndsWith(". A body that moves freely hangs on the world: in URDF name the parent link of its floating joint world, in "
+               "MJCF put it straight into <worldbody>"));
+}
+
 TEST(UrdfErrors, NegativeInertiasAreRefusedByMujoco) {
   std::string arm = link("arm");
   arm.replace(arm.find("0.02"), 4, "-0.2");
@@ -796,6 +838,23 @@ TEST(UrdfErrors, FaultsOfMimicAreNamed) {
   EXPECT_EQ(with(R"(<mimic/>)"), "robot.xml: joint 'a': its <mimic> names no joint");
   EXPECT_EQ(with(R"(<mimic joint="a" multiplier="x"/>)"),
             "robot.xml: joint 'a': the multiplier of its <mimic> must be a number, got 'x'");
+  EXPECT_EQ(with(R"(<mimic joint="a"/>)"), "robot.xml: joint 'a': it mimics itself; name another joint or remove the <mimic>");
+  EXPECT_EQ(with(R"(<mimic joint="a"/><mimic joint="b"/>)"), "robot.xml: joint 'a': its <mimic> stands twice: remove one");
+  const auto of_types = [](const char* followed, const char* follower) {
+    return error_of(urdf(link("base") + link("left") + link("right") + joint("l", followed, "base", "left") +
+                         joint("r", follower, "base", "right", R"(<mimic joint="l"/>)")));
+  };
+  const auto fault = [](const char* name, const char* type) {
+    return fmt::format(
+        "robot.xml: joint 'r': it mimics 'l', but the type of '{}' is {}: only revolute, continuous and prismatic "
+        "joints mimic or are mimicked",
+        name, type);
+  };
+  for (const char* type : {"fixed", "floating", "planar"}) {
+    EXPECT_EQ(of_types(type, "prismatic"), fault("l", type));
+    EXPECT_EQ(of_types("revolute", type), fault("r", type));
+  }
+  EXPECT_EQ(of_types("continuous", "prismatic"), "");
 }
 
 TEST(UrdfErrors, AXacroFileIsToBeExpandedFirst) {

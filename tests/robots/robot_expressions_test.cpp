@@ -538,6 +538,9 @@ TEST(RobotModel, SaysWhatIsWrong) {
     EXPECT_NE(message(more).find(part), std::string::npos) << message(more);
   };
   expect("coordinates = ['q1']", "1 names for the 7 coordinates of the robot; they are, in this order: q1, q2");
+  expect("coordinates = ['q2', 'q1', 'q3', 'q4', 'q5', 'q6', 'q7']",
+         "the name of another coordinate of the robot, of which this one is 'q1'; they are, in this order: q1, q2");
+  expect("coordinates = ['a', 'b', 'c', 'd', 'e', 'f', 'g']\ninputs = ['u1', 'u2']", "2 inputs for");
   expect("inputs = ['u1', 'u2']", "2 inputs for 7 axes of joints: give one per axis");
   expect("[mechanics]\nforce = ['1']", "expected 7 entries, one per coordinate, got 1");
   expect("[mechanics]\nmass = [['1']]", "the mass matrix is the robot's");
@@ -549,6 +552,9 @@ TEST(RobotModel, SaysWhatIsWrong) {
   expect("[constraints]\nposition = ['point(\"link7\", 1, 2, q1).x']", "must be numbers");
   expect("[constraints]\nposition = ['site(\"tip).x']", "this name in quotes does not end");
   expect("[constraints]\nposition = ['site(\"tip\") + 1']", "where a component must stand");
+  expect("[constraints]\nposition = ['geom(\"tip\").x']",
+         "unknown symbol 'geom(\"tip\").x'; a model with a robot has the points site(");
+  expect("[constraints]\nposition = ['site(tip).z']", "the name in site(...) stands in quotes");
   expect("[parameters]\nm = { of = 'mass(\"link8\")' }", "the robot has no number 'mass(\"link8\")'");
   expect("[parameters]\nm = { of = 'mass(\"link7\")' }\nm2 = { of = 'mass(\"link7\")' }", "is the parameter 'm' already");
   const std::string of_inertia = "[parameters]\nI = { of = 'inertia(\"link7\")";
@@ -564,6 +570,10 @@ TEST(RobotModel, SaysWhatIsWrong) {
   EXPECT_EQ(message("[parameters]\nc = { of = 'com(\"link7\").x', value = -0.1, bounds = [-1, 1] }"), "");
   expect("[truth]\nforce_on = { 'q1 + q2' = '1' }", "expected a point of the robot");
   expect("[truth]\nforce_on = { 'site(\"tpi\").x' = '1' }", "has no site 'tpi'");
+  for (const char* rate : {"d", "dd"}) {
+    expect(fmt::format("[truth]\nforce_on = {{ '{}site(\"tip\").x' = '1' }}", rate),
+           "a force acts along site(\"tip\").x, not along its derivative");
+  }
   expect("[truth]\nforce_on = { 'site(\"tip\").x' = 'ddq1' }", "a force may not depend on accelerations");
   EXPECT_THROW(Model::parse("coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = ['site(\"a\").x']", "m"),
                InputError);

@@ -234,6 +234,26 @@ TEST(GenerateSampling, StatesDrawnOffTheConstraintAreRefused) {
               HasSubstr("is off the constraint \"d/dt of x^2 + y^2 - 4\" by "));
 }
 
+TEST(GenerateSampling, AConstraintThatComesAndGoesIsToBeObeyedByAnExpression) {
+  const auto model = [](const std::string& rule) {
+    return Model::parse(
+        "coordinates = [\"x\", \"y\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\n[constraints]\n"
+        "velocity = [{ expr = \"dy - 0.1*x\", when = \"x > 0.5\" }]\n[truth]\nacceleration = [0, 0]\n[sampling]\n"
+        "x = [-1, 1]\ny = [-1, 1]\ndx = [-1, 1]\n" +
+            rule,
+        "m.toml");
+  };
+  for (const std::string rule : {"", "dy = [-1, 1]\n"}) {
+    EXPECT_THAT(
+        input_error_of([&] { noise_free(model(rule), 50); }),
+        AllOf(StartsWith("m.toml: [sampling]: sample "),
+              EndsWith(": the constraint \"dy - 0.1*x\" is there at some of the samples only: give dy by an expression that "
+                       "satisfies it, dy = \"…\"")))
+        << rule;
+  }
+  EXPECT_EQ(noise_free(model("dy = \"0.1*x\"\n"), 50).states.cols(), 50);
+}
+
 TEST(GenerateSampling, ContradictingConstraintsAreRefused) {
   // least squares has a solution, the constraints have none
   EXPECT_THAT(

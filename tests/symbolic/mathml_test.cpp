@@ -53,6 +53,18 @@ TEST_F(MathMl, ParenthesesStandWhereTheyAreNeeded) {
             "<mrow><mi>atan2</mi><mo>&#x2061;</mo><mrow>" + open + "<mi>a</mi><mo>,</mo><mi>b</mi>" + close + "</mrow></mrow>");
 }
 
+// no sign rises out of what is 0 where the first factor is
+TEST_F(MathMl, AMinusAfterAnotherFactorIsNoDifference) {
+  const Expression a = graph.variable("a"), x = graph.variable("x");
+  const std::string times = "<mo lspace=\"0.16em\" rspace=\"0\">&#x2062;</mo>";
+  const std::string open = "<mrow><mo stretchy=\"false\">(</mo>", close = "<mo stretchy=\"false\">)</mo></mrow>";
+  const Expression product = graph.apply(Operation::multiply_or_zero, a, -x);
+  EXPECT_EQ(to_string(product, Notation::mathml), "<mi>a</mi>" + times + open + "<mrow><mo>−</mo><mi>x</mi></mrow>" + close);
+  EXPECT_EQ(to_string(product, Notation::latex), "a \\, \\left(-x\\right)");
+  EXPECT_EQ(to_string(graph.apply(Operation::multiply_or_zero, a, graph.constant(-2) * x), Notation::latex),
+            "a \\, \\left(-2 \\, x\\right)");
+}
+
 TEST_F(MathMl, NoNameCanBecomeMarkup) {
   EXPECT_EQ(to_string(graph.variable("<b>&"), Notation::mathml), "<mi>&lt;b&gt;&amp;</mi>");
 }

@@ -117,6 +117,11 @@ TEST_F(ParserTest, ErrorsSayWhereWhatTheRuleAndTheMend) {
       {"sin + 1", "column 1: the function 'sin' has no argument; write sin(...)"},
       {"sqr(q1)", "column 1: unknown function 'sqr', did you mean 'sqrt'? Functions are " + functions},
       {"frobnicate(q1)", "column 1: unknown function 'frobnicate'. Functions are " + functions},
+      {"site(tip).x - 1", "column 1: the name in site(...) stands in quotes: write 'site(\"NAME\").x'"},
+      {"2*dpoint(arm, 0, 0, 0.1).x", "column 3: the name in dpoint(...) stands in quotes: write 'dpoint(\"NAME\", 0, 0, 0.1).x'"},
+      {"geom(\"tip\").x",
+       "column 1: unknown symbol 'geom(\"tip\").x'; a model with a robot has the points site(\"NAME\").x, body(\"NAME\").x and "
+       "point(\"BODY\", 0, 0, 0.1).x"},
       {"atan2(q1)", "column 1: atan2 takes 2 arguments, got 1"},
       {"1 + sin(q1, q2)", "column 5: sin takes 1 argument, got 2"},
       {"sin()", "column 1: sin takes 1 argument, got 0"},
@@ -268,6 +273,13 @@ TEST_F(ParserTest, AComponentOverItsLengthIsZeroAtZero) {
     EXPECT_EQ(read(to_string(graph.constant(3) * (read(text) * read("q2")))), graph.constant(3) * (read(text) * read("q2")));
   }
   EXPECT_DOUBLE_EQ(test::evaluate(read("-2*q2*q1/sqrt(q1^2 + q2^2)"), {{"q1", 3}, {"q2", 4}}), -24.0 / 5);
+  // its slope is that of sign there
+  const auto slope = [&](const std::string& text, double q1, double q2) {
+    return test::evaluate(graph.differentiate(read(text), graph.variable("q1")), {{"q1", q1}, {"q2", q2}});
+  };
+  for (const std::string text : {"q1/abs(q1)", "q1/sqrt(q1^2 + q2^2)", "q2/sqrt(q1^2 + q2^2)"}) EXPECT_EQ(slope(text, 0, 0), 0);
+  EXPECT_DOUBLE_EQ(slope("q1/sqrt(q1^2 + q2^2)", 0, 2), 0.5);
+  EXPECT_NEAR(slope("q1/sqrt(q1^2 + q2^2)", 3, 4), 16.0 / 125, 1e-15);
   // parts that are shared are looked at once
   Expression shared = graph.variable("q1");
   for (int k = 0; k < 100; ++k) shared = shared * shared + shared;

@@ -185,6 +185,7 @@ TEST(FitThroughInducingPoints, IsWithinANatOfTheExactOneAtItsHyperparameters) {
   const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
   ASSERT_TRUE(result.report.inducing.has_value());
   EXPECT_GT(result.report.inducing->n_start, 0);
+  EXPECT_EQ(result.report.inducing->n_starts, options.n_restarts);
   EXPECT_LE(result.report.inducing->n_variables, 200);
   EXPECT_LE(result.report.inducing->left_out.sum(), 1.5);
   const double exact = Posterior(p.prior, p.observations, model_values(p.prior, p.observations, result.report.hyperparameters))

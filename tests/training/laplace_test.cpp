@@ -295,6 +295,24 @@ TEST(LaplaceTest, StandardErrorsOfASingleStartAreSaidToBe) {
   EXPECT_FALSE(says_so(2));
 }
 
+// Through inducing points one run follows those that few rows were fitted with.
+TEST(LaplaceTest, OfAFitThroughInducingPointsTheStartsOfItsFirstRowsCount) {
+  const DrawnProblem p = laplace_problem(line(), 20, {"p"});
+  FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
+  const auto mend_of = [&](int n_start, int n_starts) -> std::string {
+    report.inducing.emplace();
+    report.inducing->n_start = n_start;
+    report.inducing->n_starts = n_starts;
+    for (const UncertaintyNote& note : uncertainty_notes(report)) {
+      if (note.text == "the standard errors are those about the optimum of a single start") return note.mend;
+    }
+    return "";
+  };
+  EXPECT_EQ(mend_of(400, 5), "");
+  EXPECT_EQ(mend_of(400, 1), "Other starts may lead to a better one: fit with more `restarts`");
+  EXPECT_EQ(mend_of(0, 1), "Other starts may lead to a better one: fit exactly (`inducing=none`), with several `restarts`");
+}
+
 TEST(LaplaceTest, NotesNameASingleOpenParameterManyCombinationsAndFitsThatStoppedEarly) {
   FitReport report;
   report.hyperparameters.resize(3);

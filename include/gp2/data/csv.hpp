@@ -56,13 +56,17 @@ class CsvTable {
   static CsvTable read(const std::filesystem::path& path, Keep keep = Keep::text, const Workers& workers = 0);
   /// @param name  stands for the file in messages
   static CsvTable parse(std::string_view text, std::string name, Keep keep = Keep::text);
-  /// From cells, row after row; a row's place in messages is the line it would have in a file.
+  /// From cells, row after row; a row's place in messages is its number, from 1.
   /// @throws InputError as parse, and when the cells do not fill the last row.
   static CsvTable from_cells(std::string name, std::vector<std::string> header, const std::vector<std::string>& cells);
   /// From columns; nothing is printed or parsed of those that hold numbers.
   /// @throws InputError as parse, and when the columns differ in length.
   static CsvTable from_columns(std::string name, std::vector<Column> columns);
 
+  /// The same table under another name, and of no file.
+  [[nodiscard]] CsvTable renamed(std::string name) const;
+  /// The same table, whose rows messages count from 1, as those of from_columns.
+  [[nodiscard]] CsvTable without_lines() const;
   /// The table without the rows after the first n.
   [[nodiscard]] CsvTable first_rows(int n) const;
   /// These rows, in this order.
@@ -85,9 +89,11 @@ class CsvTable {
   [[nodiscard]] bool is_empty(int row, int column) const;
   /// Whether none of its cells holds a number, and one is not empty.
   [[nodiscard]] bool is_text(int column) const;
-  [[nodiscard]] int line(int row) const;  // in the file
+  [[nodiscard]] int line(int row) const;  // in the file; without one in that which write() makes
+  /// Whether the rows are lines of a file or text.
+  [[nodiscard]] bool has_lines() const;
 
-  /// "log.csv:7: column 'q1'", for messages.
+  /// "log.csv:7: column 'q1'", for messages; without lines "data: row 6, column 'q1'".
   [[nodiscard]] std::string place(int row, int column) const;
 
   /// @throws InputError naming file, line and column when the cell is not a finite number.

@@ -75,8 +75,9 @@ struct FitFile {
 };
 
 /// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.
+/// @returns the estimated parameters of the system of a fit that are none of these
 /// @throws InputError naming the file, an unknown name (with those there are), or a value outside its bounds.
-void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters);
+std::vector<Hyperparameter> read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters);
 /// The same from values at hand.
 /// @param source  stands for them in messages
 void set_start_values(const std::map<std::string, double>& values, const std::string& source,

@@ -93,6 +93,7 @@ struct TrainingResidual {
   double rms = 0;                 // of z
   double coverage95 = 0;          // share of |z| below 1.96
   double serial_correlation = 0;  // of z of ddq from one state to the next, in the order of the observations
+  int n_serial = 0;               // values that it is of: those of all logs together that are too short to tell by themselves
   double rms_in_noise = 0;        // of (y − mean)/σ, of which the noise alone makes 1
   int n_far = 0;                  // values with |z| above six times the larger of 1 and the median |z|/0.6745
   double farthest = 0;            // of |z|

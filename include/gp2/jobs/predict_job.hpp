@@ -27,6 +27,7 @@ struct FitSystem {
   std::vector<Actuator> actuators;                            // of its inputs
   std::shared_ptr<const OtherSystem> other_system = nullptr;  // null: the fit's own
   Prior prior;                                                // there
+  std::vector<std::string> notes = {};                        // parameters that keep their values of there, not those fitted
 };
 
 /// @param prior   of the posterior

@@ -32,16 +32,20 @@ struct Relevance {
 
 /// The force that a latent adds to F along one entry of the state, mean and standard deviation. All other entries are as in one row
 /// of the training data, the nearest to their medians. Or what it is along one direction that knows the load: a coefficient.
+///
+/// It goes as far as the training data do, in the entry and in every feature of the latent, or nearly. Where features such as q1 - q2
+/// leave it less than a fifth of the entry's range, it is along the one feature that the entry changes.
 struct LearnedForce {
-  std::string latent, along;
+  std::string latent, along;       // the second: an entry of the state, or a feature
   std::vector<std::string> names;  // force_NAME, or `coefficient`; with @LATENT behind where there are several (d)
-  Eigen::VectorXd at;              // evenly over what the training data hold (n)
+  Eigen::VectorXd at;              // ascending; of an entry evenly (n)
   Eigen::MatrixXd mean, stddev;    // (d × n)
   Eigen::VectorXd data;            // where the training data are (N)
 };
 
 /// What each latent has learned, along the entries of the state that it reads and that change it most.
-std::vector<LearnedForce> learned_forces(const Posterior& posterior);
+/// @param notes  receives along which entries nothing is drawn, and why; may be null
+std::vector<LearnedForce> learned_forces(const Posterior& posterior, std::vector<std::string>* notes = nullptr);
 
 /// The motion of the fit beside a measured one, from the same start: N rows of the log where it goes on longest without a break.
 struct Rollout {
@@ -88,6 +92,7 @@ struct ReportData {
   LowerRank lower_rank;                                  // states at which constraints let go, or follow from each other
   std::vector<std::string> independent;  // accelerations to observe instead, where the outputs follow from each other
   Rollout rollout;
+  std::vector<std::string> notes;  // on the log of a test: columns that are not the rates of others
 
   /// Root mean square of truth − predicted per output (d); NaN where the truth is not known.
   [[nodiscard]] Eigen::VectorXd rmse_to_truth() const;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -9,6 +10,7 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
+#include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/option.hpp"
 
 namespace gp2 GP2_API {
@@ -30,16 +32,29 @@ std::vector<Option> options(UpdateRequest& request);
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
                                std::vector<std::string>& notes);
 
+/// Before more observations are added: an exact posterior of all must find the memory that it takes. Small ones always do.
+/// @param free   as free_memory()
+/// @param given  as is_given
+/// @throws InputError with the rows that would fit
+void require_memory_of_more(const Posterior& posterior, const Observations& more, const std::string& log,
+                            const std::function<std::optional<double>()>& free,
+                            const std::function<bool(double, int)>& given = is_given);
+
 /// update(), with a word where what went through inducing points has none near the new observations. The range of the discrepancy (T23),
 /// in the posterior and in the fit, becomes that of all rows.
 /// @param fit  whose report loses the draws of the hyperparameters under which there is no posterior of all; and learns the log's name
+/// @throws InputError as require_memory_of_more; NumericalError as update().
 Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
 /// remove_oldest() of a posterior and its fit, whose report keeps the distrusted values among what is left.
 Posterior remove_oldest(Posterior&& posterior, FitFile& fit, int n);
 
+/// Before more observations are added: what a window leaves behind goes, of what was learned and of what is added.
+/// @throws InputError as keep_newest.
+void make_room(Posterior& posterior, FitFile& fit, Observations& more, const UpdateRequest& request);
+
 /// Leaves the newest states that a window asks for, and the names of the logs that they are of, by the rows of these.
-/// @throws InputError as remove_oldest, and for a window that is not positive.
+/// @throws InputError as remove_oldest, and for a window that is not positive or of a fit through inducing points.
 void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request);
 
 struct UpdateOutcome {

@@ -40,17 +40,22 @@ std::vector<ConstraintViolation> constraint_violations(const System& system, con
 std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                      const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
-/// States where A has a lower rank than at others: a constraint lets go there, or follows from the rest. Unknown, and none, after
-/// a fault.
-struct LowerRank {
-  int usual = 0;            // the highest rank
-  int lowest = 0;           // of A over the states
-  std::vector<int> states;  // where it is below the highest, in order
+/// The rank of A at a state, rows that their conditions switch off counted as rows that are there.
+struct StateRank {
+  int rank = 0;
+  std::vector<int> inactive = {};  // rows that are switched off, in order
 };
-/// The rank of A at each state, rows that their conditions switch off counted as rows that are there.
-std::vector<int> ranks_of(const System& system, const MechanicsBatch& mechanics);
+std::vector<StateRank> ranks_of(const System& system, const MechanicsBatch& mechanics);
+
+/// States where A has a lower rank than at others with the same active rows, or with more: a constraint lets go there, or follows
+/// from the rest. Unknown, and none, after a fault.
+struct LowerRank {
+  int usual = 0;            // the highest rank, of states with the rows that are active at the lowest
+  int lowest = 0;           // of A, where it is farthest below its usual
+  std::vector<int> states;  // where it is below its usual, in order
+};
 /// @param ranks  at each state
-LowerRank states_of_lower_rank(const std::vector<int>& ranks);
+LowerRank states_of_lower_rank(const std::vector<StateRank>& ranks);
 /// The same of any number of states, in the memory of a few.
 LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                const Eigen::Ref<const Eigen::VectorXd>& parameters);

@@ -86,6 +86,8 @@ class SymbolicSystem final : public System {
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
   [[nodiscard]] bool depends_on_parameter(int index) const override { return values_.uses_input(layout().size() + index); }
+  /// Found at states where the constraints hold, if all are of positions and hold always.
+  [[nodiscard]] int largest_rank() const override { return largest_rank_; }
 
   [[nodiscard]] const Definition& definition() const { return definition_; }
 
@@ -101,6 +103,7 @@ class SymbolicSystem final : public System {
   std::vector<Tape> derivatives_;  // the same, per parameter
   Tape mechanics_, force_, residuals_;
   std::vector<Residual> residual_labels_;
+  int largest_rank_ = 0;
   std::unique_ptr<StateTape> state_tape_;  // filled when first asked for, hence
   mutable std::once_flag state_tape_is_filled_;
 };

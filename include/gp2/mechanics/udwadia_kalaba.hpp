@@ -50,8 +50,10 @@ class UdwadiaKalaba {
   }
 
   /// The same at another state. Allocates nothing where the sizes are those of the call before.
+  /// @param largest_rank  System::largest_rank: further directions of range(Bᵀ) count as redundant, and rows that have any may
+  ///                      differ from b by the error of the state
   void compute(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A,
-               const Eigen::Ref<const Eigen::VectorXd>& b);
+               const Eigen::Ref<const Eigen::VectorXd>& b, int largest_rank = std::numeric_limits<int>::max());
 
   /// Memory of the functions below that take one: they allocate nothing where the sizes are those of the call before. One
   /// workspace serves any number of objects, of one thread.
@@ -83,7 +85,7 @@ class UdwadiaKalaba {
   [[nodiscard]] double size_of_b() const { return size_of_b_; }          // largest |b|, rows of B of unit norm
 
   /// Whether no acceleration satisfies A ddq = b: |A L b − b| is above `consistency_tolerance` of what accelerates the system at
-  /// this state, |b| and the applied force F (nq), and above `rounding`.
+  /// this state, |b| and the applied force F (nq), and above `rounding`. Not of rows that are known to be redundant.
   [[nodiscard]] bool is_contradictory(const Eigen::Ref<const Eigen::VectorXd>& F,
                                       double rounding = std::numeric_limits<double>::min()) const;
   static constexpr double consistency_tolerance = 1e-6;
@@ -130,7 +132,7 @@ class UdwadiaKalaba {
  private:
   double factorise_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
   void complete_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
-  void decompose_rows();
+  void decompose_rows(int largest_rank);
   void invert_R_transposed();
   Mass mass_kind_ = Mass::positive_definite;
   int rank_ = 0;

@@ -15,7 +15,7 @@ namespace gp2 GP2_API {
 /// Which of the learned forces. What is not given is chosen: what the data determine best, where it changes most.
 struct PlotRequest {
   std::optional<std::string> what;   // latent
-  std::optional<std::string> along;  // entry of the state
+  std::optional<std::string> along;  // entry of the state, or feature, as LearnedForce has it
   std::optional<std::string> force;  // coordinate on which the force acts
 };
 

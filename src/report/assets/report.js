@@ -103,7 +103,7 @@
     const rows = report.observations.reduce((sum, group) => sum + group.n, 0);
     byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}${report.date ? `; file of ${report.date}` : ""}.`;
     const tiles = [["Optimiser", fit.converged ? "converged" : fit.iterations === 0 ? "did not run" : "not converged", `${fit.iterations} iterations, best of ${fit.restarts.length} restarts`],
-      ["Negative log likelihood", format(fit.nll), `of ${rows} rows`]];
+      ["Negative log likelihood", format(fit.nll), fit.rows_are_those_of_fit ? `of ${rows} rows` : "at the fit; rows may have changed since"]];
     const shown = test || report.data[0];
     if (shown) {
       const e = shown.figures;
@@ -142,8 +142,10 @@
     if (!model.constraints.length) {
       constraints.append(make("p", { class: "muted", text: "None: the acceleration is the unconstrained one." }));
     } else {
-      constraints.append(table("Constraints as written", [{ label: "as written" }, { label: "level" }],
-        model.constraints.map((row) => [make("code", { text: `${row.text} = 0` }), row.level])));
+      const switched = model.constraints.some((row) => row.when);
+      const when = (row) => (row.when ? make("span", {}, row.contact ? "a contact, while " : "while ", make("code", { text: row.when })) : "always");
+      constraints.append(table("Constraints as written", [{ label: "as written" }, { label: "level" }, ...(switched ? [{ label: "holds" }] : [])],
+        model.constraints.map((row) => [make("code", { text: `${row.text} = 0` }), row.level, ...(switched ? [when(row)] : [])])));
       constraints.append(make("p", { text: "Differentiated along the motion they become A q̈ = b with" }));
       for (const name of ["A", "b"]) {
         constraints.append(model[name] ? formula(model[name], `The matrix ${name}`) : make("p", { class: "muted", text: `${name} is too long to typeset: gp2 show prints it.` }));
@@ -170,6 +172,7 @@
     const again = fit.restarts[fit.best_restart];
     byId("optimiser-lead").textContent = `${fit.termination.charAt(0).toUpperCase()}${fit.termination.slice(1)}, after ${fit.iterations} iterations. ` +
       `Negative log likelihood ${format(fit.nll)}; with hyper-priors, the objective, ${format(fit.objective)}.` +
+      (fit.rows_are_those_of_fit ? "" : " Both are those at the fit; rows may have been added or taken away since.") +
       (again && again.objective !== null && again.objective - fit.objective > 1e-9 * Math.abs(fit.objective) ? " A scan from the best restart found a lower optimum than the restarts." : "") +
       (fit.draws ? ` Predictions mix ${fit.draws.n} draws of the hyperparameters by ${fit.draws.n_chains} chains: R̂ at most ${format(fit.draws.r_hat, 3)}, worth ${format(fit.draws.effective_size, 3)} independent ones or more.` : "");
     byId("restarts").append(table("Restarts of the optimiser", [{ label: "restart" }, { label: "objective", number: true }, { label: "neg. log likelihood", number: true }, { label: "iterations", number: true }, { label: "evaluations", number: true }, { label: "failed", number: true }, { label: "why it stopped", wrap: true }],
@@ -249,7 +252,7 @@
   }
 
   /**
-   * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero, quantity}, square, diagonal, height, trace,
+   * A chart by uPlot. spec: {title, summary, x: {label, values, quantity}, y: {label, log, zero, quantity}, square, diagonal, height, trace,
    * series: [{label, values, colour, kind: "points" | "line", hollow, steps, low, high}]}; low and high are a band or error bars.
    * trace: a line from point to point in the order of the data; marks: values of x that are marked at the foot.
    */
@@ -354,7 +357,7 @@
       legend: { show: false },
       cursor: { drag: { x: true, y: false }, points: { size: 8 } },
       scales: { x: { time: false, range: (u, min, max) => both || spec.x.range || padded(min, max, 0.03) }, y: spec.y.log ? { distr: 3 } : { range: yRange } },
-      axes: [axis(withUnit(spec.x.label), "x", { size: 34, space: (u, k, min, max) => Math.max(50, 8 * digitsOf(min, max)) }),
+      axes: [axis(withUnit(spec.x.label, spec.x.quantity), "x", { size: 34, space: (u, k, min, max) => Math.max(50, 8 * digitsOf(min, max)) }),
         axis(withUnit(spec.y.label, spec.y.quantity), "y", { size: (u, labels) => Math.max(50, ...(labels || []).map((text) => 10 + 6 * text.length)), ...(spec.y.log ? { splits: decades } : {}) })],
       hooks: {
         drawAxes: [behind],
@@ -412,7 +415,7 @@
     const host = keep(byId("learned-charts"), shown.length);
     shown.forEach((one, k) => chart(host.children[k], {
       title: `${one.name} along ${one.along}`, summary: `From ${format(Math.min(...one.mean), 3)} to ${format(Math.max(...one.mean), 3)}, band of ±${format(2 * rms(one.stddev), 3)} on average.`,
-      x: { label: one.along, values: one.at }, y, band: true, marks: one.data,
+      x: { label: one.along, quantity: one.along, values: one.at }, y, band: true, marks: one.data,
       series: [{ label: "learned", values: one.mean, colour: "--c1", kind: "line", low: band(one.mean, one.stddev, -1), high: band(one.mean, one.stddev, 1) }],
     }));
   }
@@ -572,9 +575,11 @@
     byId("rollout-energies").hidden = !energies;
     keep(hosts[2], energies ? 1 + motion.potentials.length : 0);
     if (!energies) return;
-    const change = (values) => { const known = values.filter((value) => value !== null); return format(known[known.length - 1] - known[0], 3); };
+    // over the same time, where the simulated motion ends early
+    const both = numbers(motion.t.length).filter((i) => motion.energy[i] !== null && motion.energy_simulated[i] !== null);
+    const change = (values) => format(values[both[both.length - 1]] - values[both[0]], 3);
     chart(hosts[2].children[0], {
-      title: "Kinetic + potential energy", summary: `changes by ${change(motion.energy)} J as measured, ${change(motion.energy_simulated)} J as simulated${motion.potentials.length ? "; learned potentials are among it" : ""}`,
+      title: "Kinetic + potential energy", summary: `changes by ${change(motion.energy)} J as measured, ${change(motion.energy_simulated)} J as simulated${motion.ended ? ", as far as both go" : ""}${motion.potentials.length ? "; learned potentials are among it" : ""}`,
       x, y: { label: "energy [J]" }, series: [measured(motion.energy), simulated(motion.energy_simulated)],
     });
     motion.potentials.forEach((one, k) => chart(hosts[2].children[1 + k], {
@@ -924,14 +929,14 @@
       ["max |A q̈ − b|, fitted", figure((e) => e.max_constraint_error_fitted)],
     ];
     // not the time within the band: a fit that knows little has a wide one
-    const off = all((one) => {
-      const motion = judged(one)?.rollout;
-      if (!motion || motion.reason || motion.ended) return null;
-      return rms(motion.measured.map((values, j) => apart(values, motion.simulated[j]) / (Math.max(...values) - Math.min(...values) || 1)));
-    });
-    if (off.some((value) => value !== null)) rows.push(["simulated motion, rms error / range", off, low]);
-    const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
     const why = whyNotComparable();
+    const motions = all((one) => judged(one)?.rollout).map((motion) => (motion && !motion.reason && !(why && motion.ended) ? motion : null));
+    // of one test over the time that all of them reached
+    const reached = Math.min(...motions.map((motion) => (motion && !why ? motion.simulated[0].filter((value) => value !== null).length : Infinity)));
+    const off = motions.map((motion) => motion && rms(motion.measured.map((values, j) => apart(values.slice(0, reached), motion.simulated[j]) / (Math.max(...values) - Math.min(...values) || 1))));
+    const early = motions.find((motion) => motion && reached < motion.t.length);
+    if (off.some((value) => value !== null)) rows.push([`simulated motion, rms error / range${early ? `, until t = ${timeOf(early, early.t[reached - 1])} s` : ""}`, off, low]);
+    const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
     // the best of a row, where one is better than the others
     if (!why) rows.forEach(([, values, cost], r) => {
       if (!cost || values.some((value) => value === null)) return;
@@ -941,7 +946,7 @@
     });
     byId("comparison-scores").append(built);
     const data = [...new Set(reports.map((one) => { const used = judged(one); return used ? `${used.name}: ${used.source}` : "none"; }))];
-    byId("comparison-scores").append(make("p", { class: "muted", text: `Scored on – ${data.join("; ")}. ${why || "The better of a row is green and bold; “without noise” is right only for targets without noise, and not marked."} Likelihoods compare where the rows learned from are the same.` }));
+    byId("comparison-scores").append(make("p", { class: "muted", text: `Scored on – ${data.join("; ")}. ${why || "The better of a row is green and bold; “without noise” is right only for targets without noise, and not marked."} Likelihoods, those at the fit, compare where the rows learned from are the same.` }));
   }
 
   function compareParameters(names) {
@@ -980,7 +985,7 @@
         const [ink, fill] = palette[i % palette.length];
         return [{ label: names[i], values: placed(curve.mean), colour: ink, band: fill, kind: "line", spanned: true, low: placed(band(curve.mean, curve.stddev, -1)), high: placed(band(curve.mean, curve.stddev, 1)) }];
       });
-      chart(host.children[k], { title: `${chosen} along ${along}`, summary: `Learned by ${series.map((one) => one.label).join(" and ")}.`, x: { label: along, values: x }, y, series, band: true });
+      chart(host.children[k], { title: `${chosen} along ${along}`, summary: `Learned by ${series.map((one) => one.label).join(" and ")}.`, x: { label: along, quantity: along, values: x }, y, series, band: true });
     });
   }
 
