@@ -158,11 +158,12 @@ std::vector<int> chosen_rows(const std::vector<int>& rows, int n, std::uint64_t 
   return chosen;
 }
 
-// Rows of a shuffled log in the order of its time, which tells whether they share their errors. Episodes stay together.
-std::vector<int> in_order_of_time(std::vector<int> rows, const System& system, const CsvTable& log,
+// Rows of a shuffled log in the order of its time, which tells whether they share their errors. Episodes stay together. Where time is
+// a part of the state, rows may well be drawn at any time.
+std::vector<int> in_order_of_time(std::vector<int> rows, const Prior& prior, const CsvTable& log,
                                   const std::map<std::string, std::string>& columns) {
-  LogReader reader(log, system, columns);
-  if (!reader.has("t")) return rows;
+  LogReader reader(log, *prior.system, columns);
+  if (!reader.has("t") || prior.reads()[static_cast<std::size_t>(prior.system->layout().t())]) return rows;
   VectorXd times;
   try {
     times = reader.values({"t"}).row(0).transpose();
@@ -673,8 +674,8 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   // what is learned from windows are sums over each position by itself, not these rows
   if (!log.windows) note_dependence(logged, readings, options, all_values, log.table, notes);
   keep_known(commanded, log.table, measured, notes);
-  const std::vector<int> rows =
-      in_order_of_time(chosen_rows(measured, options.max_points.value_or(n_rows), options.seed), system, log.table, columns);
+  const std::vector<int> rows = in_order_of_time(chosen_rows(measured, options.max_points.value_or(n_rows), options.seed),
+                                                 logged.prior, log.table, columns);
   if (rows.size() < measured.size()) {
     notes.push_back(
         fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(), options.seed));

@@ -294,8 +294,8 @@ def test_inverse_dynamics_in_a_loop_is_that_of_many_states(arm, posterior, arm_s
     solver = gp2.InverseDynamicsSolver(posterior, cov=False)
     for match, call in [
         ("accelerations", lambda: solver.inputs(start[0], [0.0])),
-        ("not a finite number", lambda: solver.inputs(start[0], [np.nan, 0.0])),
-        ("there is no prediction", lambda: solver.inputs(np.full_like(start[0], np.nan), [0.0, 0.0])),
+        ("ddshoulder is nan; what is read must be finite", lambda: solver.inputs(start[0], [np.nan, 0.0])),
+        ("shoulder is nan, elbow is nan", lambda: solver.inputs(np.full_like(start[0], np.nan), [0.0, 0.0])),
         ("cov", lambda: solver.inputs_and_cov(start[0], [0.0, 0.0])),
         ("outputs", lambda: gp2.InverseDynamicsSolver(posterior, outputs=["ddknee"])),
     ]:
