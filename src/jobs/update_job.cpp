@@ -340,8 +340,7 @@ void require_window(const Posterior& posterior, const UpdateRequest& request) {
   if (posterior.summary()) {
     throw InputError(
         "`window`: what was learned through inducing points cannot be taken away, since the observations themselves are not "
-        "kept; "
-        "`forget` discounts it");
+        "kept; `forget` discounts it");
   }
 }
 

@@ -258,7 +258,7 @@ Expression ExpressionGraph::apply(Operation operation, Expression a, Expression 
 
 namespace {
 
-/// Whether e is 1/n with a length |g| or √(g² + …) among the factors of n; under the root of arcus sine is a difference.
+/// Whether e is 1/n with a length |g| or √(g² + …) among the factors of n; under that of the slope of asin is a difference.
 bool is_over_length(Expression e) {
   if (e.operation() != Operation::divide || !e.left().is_constant(1)) return false;
   const auto is_length = [](Expression n) {

@@ -70,7 +70,7 @@ struct FitProblemOptions {
   /// hyper-priors.
   bool discrepancy = true;
   std::optional<CsvTable> commands;         // the whole log of inputs over t, where the logs are rows of it
-  std::optional<int> max_points;            // of each log: the first of a shuffle by `seed`
+  std::optional<int> max_points;            // of each log: so many at random, by `seed`, in its order
   std::optional<double> also_noise_stddev;  // of every row that is known; not given: [noise], where it is an acceleration
   std::optional<double> time_step;          // Δt of a known next velocity
   bool project = false;                     // states onto the constraints, at the model's parameters, before anything else
