@@ -36,24 +36,28 @@ std::map<std::string, std::string> columns_of(const Model& model, std::map<std::
   return columns;
 }
 
+}  // namespace
+
+bool is_empty_column(const CsvTable& log, int column) {
+  for (int row = 0; row < log.n_rows(); ++row) {
+    if (!log.is_empty(row, column)) return false;
+  }
+  return true;
+}
+
+namespace {
+
 // Whether a log has a column for this, with something in it.
 bool has_values(LogReader& reader, const CsvTable& log, const std::string& name) {
   const int column = reader.column(name);
-  for (int row = 0; column >= 0 && row < log.n_rows(); ++row) {
-    if (!log.is_empty(row, column)) return true;
-  }
-  return false;
+  return column >= 0 && !is_empty_column(log, column);
 }
 
 void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
   std::ranges::move(reader.notes(), std::back_inserter(notes));
   std::vector<std::string> unused = reader.unused_columns();
   // an empty one may be needed where it has values
-  std::erase_if(unused, [&](const std::string& name) {
-    bool is_empty = true;
-    for (int row = 0; is_empty && row < log.n_rows(); ++row) is_empty = log.is_empty(row, log.find(name));
-    return is_empty;
-  });
+  std::erase_if(unused, [&](const std::string& name) { return is_empty_column(log, log.find(name)); });
   if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log.name(), fmt::join(unused, ", ")));
 }
 

@@ -58,6 +58,9 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
                                    const FitProblemOptions& options, const std::vector<Eigen::VectorXd>& signal_stddev,
                                    LogRows& rows, std::vector<std::string>& notes);
 
+/// Whether no row of a log has something in a column.
+bool is_empty_column(const CsvTable& log, int column);
+
 /// States, and the values measured there.
 struct MeasuredRows {
   const Eigen::MatrixXd &states, &values;

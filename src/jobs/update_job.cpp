@@ -311,12 +311,8 @@ void extend_range(Posterior& posterior, FitFile& fit, const Observations& more) 
 std::vector<std::string> measured_somewhere(std::vector<std::string> names, const LogReader& reader,
                                             const UpdateRequest& request) {
   const auto is_empty = [&](const std::string& column) {
-    const CsvTable& log = reader.table();
-    const int at = log.find(column);
-    for (int row = 0; at >= 0 && row < log.n_rows(); ++row) {
-      if (!log.is_empty(row, at)) return false;
-    }
-    return at >= 0;
+    const int at = reader.table().find(column);
+    return at >= 0 && is_empty_column(reader.table(), at);
   };
   std::erase_if(names, [&](const std::string& name) {
     const bool lacks_stddevs = !request.noise_stddev && is_empty(reader.stddev_column(name));
