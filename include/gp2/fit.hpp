@@ -185,9 +185,11 @@ inline constexpr int draw_evaluations = 3600;
 /// Same seed, same bits, for any number of threads. With n_draws hyperparameters are drawn about the optima then, at the cost of
 /// at most `draw_evaluations` more gradients, and the posterior is the mixture.
 ///
+/// A hyperparameter of equal bounds is held at their value.
+///
 /// @throws InputError and NumericalError, as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
-/// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood, or
-/// `stop` was set before one did.
+/// a start lies outside its bounds, an option has no meaning, or there are sums over states beside `n_inducing` or `n_train`;
+/// NumericalError when no restart reached a finite likelihood, or `stop` was set before one did.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options = {});
 

@@ -56,7 +56,8 @@ class Model {
   static Model parse(std::string text, std::string name, const RobotSource& robot, const ModelCode& code = {});
 
   /// A model without a file: its text declares what a fit on disk must hold, the rest is code, as for `parse`.
-  /// @throws InputError as make_prior.
+  /// @throws InputError as make_prior; as `parse`; and when the text has no words for a spec: Base::admissible, one bound without
+  /// the other, or per_direction beside lengthscales of single features, where the kernel does not imply it.
   static Model from_code(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents);
 
   struct Noise {

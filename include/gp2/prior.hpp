@@ -112,7 +112,8 @@ struct PriorValues {
 };
 
 /// φ_a at N states (N × D_a), one row per state: the layout kernels read.
-/// @throws InputError that names the state where a feature is not a finite number, and the feature.
+/// @throws InputError when there is no such latent; and one that names the state where a feature is not a finite number, and the
+/// feature.
 Eigen::MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 /// A number that is not finite is told by the `fault` of what is returned …

@@ -136,7 +136,9 @@ struct SimulateOptions {
   PushedAcceleration pushed;         // what says how the friction of an impact follows from its load; none: it has no friction
   Acceleration record;               // another function of the state, of any size, that is wanted at the times; none
   double initial_step = 0;           // [s]; 0: found from the first two accelerations
-  const std::atomic<bool>* stop = nullptr;  // once set the motion ends with its next step
+  std::string max_steps_advice =
+      "loosen the tolerances, or allow more steps (`max_steps`)";  // in the error when they are reached
+  const std::atomic<bool>* stop = nullptr;                         // once set the motion ends with its next step
 };
 
 /// A motion at the times asked for.

@@ -17,7 +17,7 @@ namespace gp2 GP2_API {
 /// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
 /// inputs (Geist & Trimpe 2020, eq. 10).
 struct OtherSystem {
-  Prior prior;              // as many latents as the fitted prior, with the same kernels, features and numbers of directions
+  Prior prior;  // as many latents as the fitted prior, with the same kernels, names of features and numbers of directions
   std::vector<int> shared;  // per parameter of its system: which parameter of the fitted system it is; −1: it has its own value
 
   /// The parameters there, given those of the fitted system.
@@ -84,6 +84,7 @@ bool reads_loads(const Prior& prior);
 
 /// A view as it is under A ddq = b + push.
 /// @param push  (nc), 0 of rows that are not there
+/// @throws InputError when it is of another size.
 View pushed(const Prior& fitted, View view, const Eigen::VectorXd& push);
 
 /// What a view looks at: the prior of its other system, or the fitted one; and the parameters there.

@@ -383,7 +383,8 @@ constraints
 derivatives(states, parameters, name) -> (dM, dA, db, dF)
     in one parameter, exact; default: central differences
 residuals(states, parameters) -> (n, rows)
-    c and dc/dt of each constraint at position level, c of each at velocity level; without them motions are not projected
+    c and dc/dt of each constraint at position level, c of each at velocity level; without them motions are not projected, and
+    rows that follow from others must be left out if states are measured
 reads
     names of the entries of a state that the functions read; a log needs these columns. Default: all, t too
 

@@ -689,6 +689,13 @@ const std::vector<std::string>& CsvTable::header() const { return content_->head
 
 int CsvTable::n_rows() const { return static_cast<int>(content_->lines.size()); }
 
+bool CsvTable::is_empty(int column) const {
+  for (int row = 0; row < n_rows(); ++row) {
+    if (!is_empty(row, column)) return false;
+  }
+  return true;
+}
+
 bool CsvTable::is_text(int column) const {
   bool has_text = false;
   for (int row = 0; row < n_rows(); ++row) {

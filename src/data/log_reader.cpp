@@ -172,10 +172,7 @@ MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
 
 bool LogReader::measures(const std::string& name) const {
   const int column = find(name);
-  for (int row = 0; column >= 0 && row < table_.n_rows(); ++row) {
-    if (!table_.is_empty(row, column)) return true;
-  }
-  return false;
+  return column >= 0 && !table_.is_empty(column);
 }
 
 std::string LogReader::stddev_column(const std::string& name) const {

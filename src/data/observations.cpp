@@ -161,9 +161,18 @@ void Observations::require_no_sums() const {
 
 namespace {
 
-void require_states(int first, int n, int n_all) {
+void require_states(Index first, Index n, Index n_all) {
   if (first >= 0 && n >= 0 && n <= n_all - first) return;
   throw InputError(fmt::format("observations: {} states from number {} on are asked for, of {}", n, first, n_all));
+}
+
+void require_row(Index k, Index n_rows) {
+  if (k >= 0 && k < n_rows) return;
+  throw InputError(fmt::format("observations: there are the rows 0 … {}, got {}", n_rows - 1, k));
+}
+
+void require_stddev(const Eigen::Ref<const VectorXd>& stddev, Index n_rows) {
+  require_shape("observations: the noise of each row", stddev, n_rows, 1);
 }
 
 }  // namespace
@@ -199,6 +208,8 @@ void Observations::remove_first(int n) {
 }
 
 VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
+  require_stddev(stddev, values().rows());
+  require_states(i, 1, n_data());
   VectorXd noise = noise_.at(stddev, i);
   for (Index k = 0; k < noise.size(); ++k) {
     if (std::isnan(values()(k, i))) noise[k] = std::numeric_limits<double>::infinity();
@@ -207,16 +218,19 @@ VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index 
 }
 
 MatrixXd Observations::noise_of_values(const Eigen::Ref<const VectorXd>& stddev) const {
+  require_stddev(stddev, values().rows());
   return values().array().isNaN().select(std::numeric_limits<double>::infinity(), noise_.of_values(stddev, n_data()));
 }
 
 bool Observations::states_noise(Index k) const {
+  require_row(k, values().rows());
   if (!noise_.has_scale()) return false;
   const std::vector<double> scales = measured_scales(k);
   return !scales.empty() && *std::min_element(scales.begin(), scales.end()) != 1;
 }
 
 std::vector<double> Observations::measured_scales(Index k) const {
+  require_row(k, values().rows());
   std::vector<double> scales;
   for (Index i = 0; i < values().cols(); ++i) {
     if (!std::isnan(values()(k, i))) scales.push_back(noise_.has_scale() ? noise_.scale()(k, i) : 1);
@@ -225,6 +239,7 @@ std::vector<double> Observations::measured_scales(Index k) const {
 }
 
 VectorXd Observations::usual_noise(const Eigen::Ref<const VectorXd>& stddev) const {
+  require_stddev(stddev, values().rows());
   VectorXd usual = stddev;
   for (Index k = 0; k < usual.size() && noise_.has_scale(); ++k) {
     std::vector<double> scales = measured_scales(k);

@@ -84,6 +84,7 @@ static void solve_load(const workspace *w, int n, real *X)
 static int reach_load(const component *c, real share, real size, workspace *w)
 {
   real *const lambda = w->y + NX;
+  real before = 0;
   for (int step = 0; step < 40; ++step) {
     evaluate_load(c, w);
     if (!is_finite(NQ, w->a_under_load) || !is_finite(NQ * NC, w->slope)) return 0;
@@ -98,8 +99,11 @@ static int reach_load(const component *c, real share, real size, workspace *w)
     const real rest = sqrt(dot(NC, change, change));
     solve_load(w, 1, change);
     for (int k = 0; k < NC; ++k) lambda[k] -= change[k];
-    const real enough = @newton@ * (size + sqrt(dot(NC, lambda, lambda)));
-    if (sqrt(dot(NC, change, change)) <= enough || rest <= enough / 10) return is_finite(NC, lambda);
+    const real terms = size + sqrt(dot(NC, lambda, lambda)), enough = @newton@ * terms, moved = sqrt(dot(NC, change, change));
+    /* large forces that cancel round more than lambda does: steps then stop getting smaller here */
+    const int is_rounding = step > 0 && moved <= @newton_stops@ * terms && 2 * moved >= before;
+    if (moved <= enough || rest <= enough / 10 || is_rounding) return is_finite(NC, lambda);
+    before = moved;
   }
   return 0;
 }

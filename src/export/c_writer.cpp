@@ -252,6 +252,7 @@ void Writer::set_sizes() {
       {"small_norm", single ? "1e-15f" : "1e-140"},
       {"large_norm", single ? "1e15f" : "1e140"},
       {"newton", single ? "4e-6f" : "1.5e-14"},
+      {"newton_stops", single ? "1e-3f" : "1e-10"},
       {"smallest_row", single ? "1.17549435e-38f" : "2.2250738585072014e-308"},
       {"if_singular", what_needs_acceleration(prior_, view_) ? "NO_UNCONSTRAINED_ACCELERATION" : "OK"},
   };

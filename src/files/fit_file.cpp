@@ -239,10 +239,10 @@ std::vector<Hyperparameter>::iterator find_named(std::vector<Hyperparameter>& hy
 
 }  // namespace
 
-std::vector<Hyperparameter> read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
+std::map<std::string, double> read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters,
+                                                const std::vector<std::string>& others) {
   ParsedJson json = parse_json(read_file(path), path);
-  std::map<std::string, double> values;
-  std::vector<Hyperparameter> left_out;
+  std::map<std::string, double> values, left_out;
   if (is_fit(json)) {
     // a fit may have had more to tune than this one; a hand-written value must mean something
     const std::vector<Hyperparameter> of_fit = hyperparameters_of(path, json);
@@ -250,8 +250,14 @@ std::vector<Hyperparameter> read_start_values(const std::filesystem::path& path,
       if (find_named(hyperparameters, h.name) != hyperparameters.end()) {
         values[h.name] = h.value;
       } else if (h.is_system_parameter()) {
-        left_out.push_back(h);
+        left_out[h.name] = h.value;
       }
+    }
+    if (json.contains("actuators")) {
+      naming(path, [&] {
+        for (const ParsedJson& one : json.at("actuators"))
+          left_out[one.at("name").get<std::string>()] = one.at("value").get<double>();
+      });
     }
     if (values.empty() && !of_fit.empty() && !hyperparameters.empty()) {
       throw InputError(fmt::format("{}: none of its hyperparameters, '{}' and so on, is one of this fit, '{}' and so on",
@@ -261,7 +267,7 @@ std::vector<Hyperparameter> read_start_values(const std::filesystem::path& path,
     for (const auto& [name, value] : json.items()) {
       if (!value.is_number())
         throw InputError(fmt::format("{}: '{}' is not a number but {}", path.string(), name, value.type_name()));
-      values[name] = value.get<double>();
+      (std::ranges::find(others, name) == others.end() ? values : left_out)[name] = value.get<double>();
     }
   } else {
     throw InputError(fmt::format("{}: expected {{\"name\": value, …}} or a file written by gp2 fit", path.string()));

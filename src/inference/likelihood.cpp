@@ -29,6 +29,8 @@ struct Likelihood::Implementation {
   std::vector<BlocksOfStates::Kept> kept_blocks;  // through inducing points, where they are small enough
   std::shared_ptr<const Linearisation> about;     // of the initial values
   int initial_size = 0;
+  VectorXd initial_parameters;
+  std::vector<VectorXd> initial_noise_stddev;
   std::shared_ptr<const char> identity = std::make_shared<const char>();
 
   // what is made once, under the values that nothing changes
@@ -37,6 +39,8 @@ struct Likelihood::Implementation {
   // whether derivatives at single samples are asked for
   [[nodiscard]] bool differentiates_samples() const { return options.noise_gradient || !options.gradient_parameters.empty(); }
   [[nodiscard]] std::vector<GramGradientParts> parts(const Reduction* reduction, const ModelValues& values) const;
+  // that what was reduced once is as it was
+  void require_initial(const ModelValues& values) const;
   // adds what belongs to the rows of a block
   void add_rows(const RowBlock& block, const GramGradient& of_rows, const ModelValues& values, ModelGradient& gradient) const;
 };
@@ -150,6 +154,8 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.observations = std::move(observations);
   self.options = std::move(options);
   self.about = initial.about;
+  self.initial_parameters = initial.parameters;
+  self.initial_noise_stddev = initial.noise_stddev;
   require_learnable(self.prior, self.observations);
   if (initial.inducing) {
     self.prepare_blocks(initial);
@@ -195,6 +201,19 @@ void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
   if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, about.get()));  // names the state
   initial_size = static_cast<int>(options.workers.sum(size));
   if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
+}
+
+void Likelihood::Implementation::require_initial(const ModelValues& values) const {
+  if (!options.gradient_parameters.empty()) return;  // all is reduced anew
+  if (values.parameters != initial_parameters) {
+    throw InputError(
+        "values: parameters of a likelihood that gives no derivative in them must be those that it was made with; make "
+        "another, or name one in gradient_parameters");
+  }
+  if (options.noise_gradient || values.noise_stddev == initial_noise_stddev) return;
+  throw InputError(
+      "values: noise_stddev of a likelihood that gives no derivative in it must be that which it was made with; make another, or "
+      "set noise_gradient");
 }
 
 Likelihood::~Likelihood() = default;
@@ -267,6 +286,7 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   const Implementation& self = implementation();
   Workspace::Implementation& work = require_held(workspace.implementation_, "Likelihood::Workspace");
   require_values(self.prior, self.observations, values);
+  self.require_initial(values);
   if (!values.inducing && self.features.size() < self.observations.size()) {
     throw InputError("values: the likelihood was made through inducing points, and these have none");
   }

@@ -19,8 +19,10 @@
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
 #include "inference/nonlinear_motion.hpp"
+#include "jobs/acting_states.hpp"
 #include "jobs/rate_check.hpp"
-#include "jobs/read_observations.hpp"
+#include "jobs/reading_notes.hpp"
+#include "jobs/repeated_rows.hpp"
 #include "mechanics/in_blocks.hpp"
 #include "mechanics/known_multipliers.hpp"
 
@@ -380,6 +382,8 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
     if (is_stuck(q) && !log.states.row(layout.dq(j)).hasNaN() && !is_stuck(log.states.row(layout.dq(j))))
       add(system.coordinates()[static_cast<std::size_t>(j)].name);
   }
+  for (std::string& text : stuck_channels(system, log.states, log.accelerations))
+    findings.push_back({Level::warning, std::move(text)});
   const int n_repeated = n_repeated_rows({{log.states, log.accelerations}});
   if (n_repeated * 20 > log.states.cols()) {
     findings.push_back(

@@ -69,6 +69,10 @@ CommandRecord::CommandRecord(const System& system, LogReader& reader, std::vecto
     }
   }
   for (Part& part : parts_) part.commands = commands(Eigen::all, part.rows);
+  constexpr double little = 0.01;
+  const MatrixXd sizes = commands.array().isNaN().select(0.0, commands.cwiseAbs());
+  small_ = VectorXd::Zero(sizes.rows());
+  for (Index k = 0; k < sizes.rows() && sizes.cols() > 0; ++k) small_[k] = little * sizes.row(k).maxCoeff();
 }
 
 std::vector<CommandRecord::Place> CommandRecord::places(LogReader& reader) const {
@@ -104,9 +108,12 @@ bool CommandRecord::begins_at_rest(const Place& place, double reach) const {
   const Part& part = parts_[static_cast<std::size_t>(place.part)];
   const Index within = std::upper_bound(part.times.begin(), part.times.end(), part.times.front() + reach) - part.times.begin();
   const Index n = std::min(std::max<Index>(within, 2), part.commands.cols());
-  return std::ranges::all_of(part.commands.rowwise(), [&](const auto& command) {
-    return command[0] == 0 || (n > 1 && (command.head(n).array() == command[0]).all());
-  });
+  for (Index k = 0; k < part.commands.rows(); ++k) {
+    const auto command = part.commands.row(k).head(n);
+    const bool stays = n > 1 && ((command.array() - command[0]).abs() <= small_[k]).all();
+    if (!stays && !(std::abs(command[0]) <= small_[k])) return false;
+  }
+  return true;
 }
 
 double CommandRecord::usual_change() const {

@@ -49,9 +49,9 @@ double size_of(const Means& of_groups) {
   return std::sqrt(squares);
 }
 
-Means times(Means means, double factor) {
-  for (MatrixXd& one : means) one *= factor;
-  return means;
+Means less_means(Means of_groups) {
+  for (MatrixXd& one : of_groups) one.colwise() -= VectorXd(one.rowwise().mean());
+  return of_groups;
 }
 
 // Measured values, and sums over states, times a factor and with something added to each.
@@ -84,15 +84,25 @@ Cost cost_under(const Prior& prior, ModelValues values) {
   };
 }
 
+// How many values were measured.
+double n_measured(const std::vector<Observations>& observations) {
+  Eigen::Index n = 0;
+  for (const Observations& group : observations) {
+    n += group.values().array().isFinite().count();
+    if (group.has_sums()) n += std::ssize(group.sums());
+  }
+  return static_cast<double>(n);
+}
+
 // Half of the squared residuals from the prior mean, in units of their deviations under some values.
-std::optional<double> misfit_of(const Prior& prior, const ModelValues& values, const std::vector<Observations>& observations) {
+std::optional<double> misfit_of(const Prior& prior, const Cost& cost, const ModelValues& values,
+                                const std::vector<Observations>& observations) {
   std::vector<Observations> at_mean;
   for (const Observations& group : observations) {
     const auto mean = mean_of(prior, values, group, group.states());
     if (!mean) return std::nullopt;
     at_mean.push_back(transformed(group, 0, *mean));
   }
-  const Cost cost = cost_under(prior, values);
   return cost(observations) - cost(at_mean);
 }
 
@@ -100,6 +110,12 @@ std::optional<double> misfit_of(const Prior& prior, const ModelValues& values, c
 struct InputFactor {
   double factor = 1, stddev = 0;
   double gain = 0;  // in log likelihood
+
+  /// Not by chance, and far enough to matter.
+  [[nodiscard]] bool is_other_than_one() const {
+    constexpr double far = 0.1, sure = 5;  // the latter in deviations
+    return std::abs(factor - 1) > std::max(far, sure * stddev);
+  }
 };
 
 // The log likelihood is quadratic in the factor, of latents that enter nonlinearly as long as their load hardly changes: three values
@@ -114,16 +130,33 @@ InputFactor likeliest_factor(const std::vector<Observations>& observations, cons
   return {1 + step, 1 / std::sqrt(curvature), 0.5 * curvature * step * step};
 }
 
-// An input that acts otherwise than logged.
+constexpr int known_force = -2;  // in the place of an input: the force without inputs
+
+// An input that acts otherwise than logged, or the known force otherwise than modelled.
 struct Hypothesis {
   enum class Kind { factor, late, exchanged };
   Kind kind;
-  Means change;     // of the mean
-  Means added;      // what the input adds to the mean then
-  int rows = 0;     // by which it is late
-  int other = -1;   // input that it is exchanged with
+  int input;       // or known_force
+  Means change;    // of the mean
+  Means added;     // what the input adds to the mean then
+  int rows = 0;    // by which it is late
+  int other = -1;  // input that it is exchanged with
+  double factor = 1;
   double gain = 0;  // in log likelihood
   std::string text = {}, cause = {};
+
+  /// The same of an effect that is larger by a factor.
+  [[nodiscard]] Hypothesis times(const InputFactor& one) const {
+    Hypothesis out = *this;
+    out.factor = one.factor;
+    out.gain = one.gain;
+    const bool is_of_force = input == known_force;
+    out.text = fmt::format("it acts {:.2g} ± {:.2g} times as {}", one.factor, one.stddev, is_of_force ? "modelled" : "logged");
+    out.cause = is_of_force ? "A sign, a unit or a parameter of it is wrong, or an inertia that it moves"
+                            : "A sign or a unit is wrong, or an inertia that it moves, or it acts late";
+    for (std::size_t g = 0; g < added.size(); ++g) out.change[g] = (one.factor - 1) * added[g];
+    return out;
+  }
 };
 
 // What is asked of the inputs.
@@ -138,7 +171,7 @@ struct Doubted {
   /// What changes where the input rows of the states are others, and what one of them adds then. Nothing where that is no number.
   template <typename StatesOf>
   [[nodiscard]] std::optional<Hypothesis> hypothesis(Hypothesis::Kind kind, int input, const StatesOf& states_of) const {
-    Hypothesis out{kind, {}, {}};
+    Hypothesis out{kind, input, {}, {}};
     const Prior& prior = posterior.prior();
     for (std::size_t g = 0; g < some.size(); ++g) {
       MatrixXd states = states_of(g);
@@ -155,6 +188,24 @@ struct Doubted {
 
   [[nodiscard]] std::optional<Hypothesis> as_logged(int input) const {
     return hypothesis(Hypothesis::Kind::factor, input, [&](std::size_t g) { return some[g].states(); });
+  }
+
+  /// The effect of the known force without inputs.
+  [[nodiscard]] std::optional<Hypothesis> force() const {
+    Hypothesis out{Hypothesis::Kind::factor, known_force, {}, {}};
+    const StateLayout layout = posterior.prior().system->layout();
+    Prior unforced = posterior.prior();
+    unforced.mean = Prior::Mean::zero;
+    for (const Observations& group : some) {
+      MatrixXd states = group.states();
+      for (int j = 0; j < layout.nu; ++j) states.row(layout.u(j)).setZero();
+      const auto with = mean_of(posterior.prior(), posterior.values(), group, states);
+      const auto without = mean_of(unforced, posterior.values(), group, states);
+      if (!with || !without) return std::nullopt;
+      out.added.emplace_back(*with - *without);
+      out.change.emplace_back(MatrixXd::Zero(with->rows(), with->cols()));
+    }
+    return out;
   }
 
   [[nodiscard]] std::optional<Hypothesis> late(int input, int rows) const {
@@ -216,9 +267,9 @@ std::optional<int> lines_apart(const std::vector<std::vector<int>>& lines) {
 constexpr double least_gain = 10;  // nats
 constexpr int most_late = 16;      // by which an input is taken to be late
 
-// An input, in all logs or in one.
+// An input, in all logs or in one; or the known force without inputs.
 struct InputEffect {
-  int input;
+  int input;  // or known_force
   std::string name;
   Hypothesis as_logged;
   std::vector<Hypothesis> late = {}, exchanged = {};  // with those before it
@@ -235,7 +286,6 @@ struct InputEffect {
 
 // Nothing where there is no number without the input.
 std::optional<InputEffect> effect_of(const Doubted& doubted, int input) {
-  constexpr double large = 0.1;  // of what is added
   auto as_logged = doubted.as_logged(input);
   if (!as_logged) return std::nullopt;
   const System& system = *doubted.posterior.prior().system;
@@ -244,9 +294,9 @@ std::optional<InputEffect> effect_of(const Doubted& doubted, int input) {
     if (doubted.taken.empty()) break;
     std::optional<Hypothesis> late = doubted.late(input, rows);
     if (!late) break;
-    const double share = size_of(late->change) / size_of(effect.as_logged.added);
-    if (rows == 1 && !(share < 1)) break;  // rows in no order, or too far apart to tell
-    if (share > large) effect.late.push_back(*std::move(late));
+    // rows in no order, or too far apart to tell
+    if (rows == 1 && !(size_of(late->change) < size_of(less_means(effect.as_logged.added)))) break;
+    effect.late.push_back(*std::move(late));
   }
   return effect;
 }
@@ -254,17 +304,9 @@ std::optional<InputEffect> effect_of(const Doubted& doubted, int input) {
 // What the data would have an input do, the likeliest first; none where they have nothing against it.
 std::vector<Hypothesis> doubts_of(const InputEffect& input, const std::vector<Observations>& observations, double as_logged,
                                   const Cost& cost) {
-  constexpr double far = 0.5, sure = 5;  // from a factor of 1; deviations
   std::vector<Hypothesis> doubts;
   const InputFactor one = likeliest_factor(observations, input.as_logged.added, as_logged, cost);
-  if (std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > least_gain) {
-    Hypothesis scaled = input.as_logged;
-    scaled.gain = one.gain;
-    scaled.text = fmt::format("it acts {:.2g} ± {:.2g} times as logged", one.factor, one.stddev);
-    scaled.cause = "A sign or a unit is wrong, or an inertia that it moves, or it acts late";
-    scaled.change = times(scaled.added, one.factor - 1);
-    doubts.push_back(std::move(scaled));
-  }
+  if (one.is_other_than_one() && one.gain > least_gain) doubts.push_back(input.as_logged.times(one));
   for (const std::vector<Hypothesis>* const some : {&input.late, &input.exchanged}) {
     for (const Hypothesis& other : *some) {
       const double gain = as_logged - cost(without_change(observations, other.change, 1));
@@ -277,74 +319,90 @@ std::vector<Hypothesis> doubts_of(const InputEffect& input, const std::vector<Ob
   return doubts;
 }
 
-// Whether data under a hypothesis are as those of a sound model. Latents and noise take up what an input does otherwise: they are
-// fitted anew. Then a sound hypothesis leaves little of the misfit, and the input acts as it says.
-class Explanation {
- public:
-  Explanation(const Doubted& doubted, const std::vector<Observations>& observations, const Hypothesis& hypothesis)
-      : observations_(observations),
-        prior_(doubted.posterior.prior()),
-        hypothesis_(hypothesis),
-        mended_(without_change(observations, hypothesis.change, 1)),
-        values_(doubted.fitted_values(mended_)),
-        cost_(cost_under(prior_, values_)),
-        left_(cost_(mended_)) {}
-
-  [[nodiscard]] bool is_sound() const {
-    // a wrong inertia is mended by a factor in part alone; an input that is one row off leaves more than noise
-    const bool is_factor = hypothesis_.kind == Hypothesis::Kind::factor;
-    const double least = is_factor ? 0.5 : 0.8;  // share of the misfit
-    constexpr double near = 0.25;                // from a factor of 1
-    const auto misfit = misfit_of(prior_, values_, observations_);
-    if (!misfit || !(cost_(observations_) - left_ > least * *misfit)) return false;
-    return is_factor || std::abs(likeliest_factor(mended_, hypothesis_.added, left_, cost_).factor - 1) < near;
-  }
-  /// How much likelier the data are under another hypothesis.
-  [[nodiscard]] double gain_of(const Hypothesis& other) const {
-    return left_ - cost_(without_change(observations_, other.change, 1));
-  }
-
- private:
-  const std::vector<Observations>& observations_;
-  const Prior& prior_;
-  const Hypothesis& hypothesis_;
-  std::vector<Observations> mended_;
-  ModelValues values_;  // fitted to these
-  Cost cost_;
-  double left_;
+// A hypothesis where latents and noise were fitted anew, since they take up what an input does otherwise.
+struct Explanation {
+  Hypothesis hypothesis;
+  double left = 0;  // cost of the data under it
+  bool is_sound = false;
 };
 
-// By how many rows an input is late, under what is fitted to it being late; nothing: no delay explains the data.
-std::optional<Hypothesis> sound_delay(const Doubted& doubted, const std::vector<Observations>& observations, int input,
-                                      Hypothesis late) {
+// The likeliest delay or factor of all, where it is another one than the hypothesis has.
+std::optional<Hypothesis> better_one(const Doubted& doubted, const std::vector<Observations>& observations,
+                                     const Hypothesis& hypothesis, double left, const Cost& cost) {
+  std::optional<Hypothesis> better;
+  if (hypothesis.kind == Hypothesis::Kind::factor) {
+    const InputFactor one = likeliest_factor(observations, hypothesis.added, cost(observations), cost);
+    if (std::abs(one.factor - hypothesis.factor) > one.stddev) better = hypothesis.times(one);
+  }
+  for (int rows = -most_late; rows <= most_late && hypothesis.kind == Hypothesis::Kind::late; ++rows) {
+    if (rows == 0 || rows == hypothesis.rows) continue;
+    std::optional<Hypothesis> other = doubted.late(hypothesis.input, rows);
+    if (!other) continue;
+    other->gain = left - cost(without_change(observations, other->change, 1));
+    if (other->gain > (better ? better->gain : 0)) better = std::move(other);
+  }
+  return better;
+}
+
+// Whether data under a hypothesis are as those of a sound model: nearly all that is left of the misfit is what noise gives. Latents
+// that follow a wrong model give that too; but then the data as logged are hardly less likely, or others seem wrong beside it.
+bool is_sound(const Doubted& doubted, const std::vector<Observations>& observations, const std::vector<Observations>& mended,
+              const std::vector<InputEffect>& inputs, const Hypothesis& hypothesis, const ModelValues& values, const Cost& cost) {
+  constexpr double half_row = 0.25;  // of the gain, that an input leaves which acts between two rows
+  constexpr double others = 0.1;     // of the gain: of several wrong inputs one is mended at a time
+  constexpr double near = 0.25;      // from a factor of 1
+  constexpr double large = 0.5;      // of a factor less 1: smaller ones mend something of many wrong models
+  const double left = cost(mended), gain = cost(observations) - left, by_noise = n_measured(observations) / 2;
+  const bool is_factor = hypothesis.kind == Hypothesis::Kind::factor;
+  const double rest = hypothesis.input == known_force ? 0 : (is_factor ? others : half_row) * gain;
+  const auto misfit = misfit_of(doubted.posterior.prior(), cost, values, mended);
+  if (!misfit || !(*misfit < std::max(2 * by_noise, rest))) return false;
+  const InputFactor factor = likeliest_factor(mended, hypothesis.added, left, cost);
+  if (is_factor) {
+    const double much = std::abs(hypothesis.factor - 1) > large ? 1 : 4;
+    return InputFactor{hypothesis.factor, factor.stddev}.is_other_than_one() && gain > much * by_noise;
+  }
+  if (!(std::abs(factor.factor - 1) < near) || std::abs(hypothesis.rows) == most_late) return false;
+  if (!(gain > by_noise)) return false;
+  return gain > 4 * by_noise || std::ranges::all_of(inputs, [&](const InputEffect& other) {
+           return other.input == hypothesis.input || doubts_of(other, mended, left, cost).empty();
+         });
+}
+
+// The hypothesis of its kind that is the likeliest under what is fitted to it. Nothing where none is.
+std::optional<Explanation> fitted_anew(const Doubted& doubted, const std::vector<Observations>& observations,
+                                       const std::vector<InputEffect>& inputs, Hypothesis hypothesis) {
   constexpr int most_fits = 4;
-  const double gain = late.gain;
   for (int k = 0; k < most_fits; ++k) {
-    const Explanation explanation(doubted, observations, late);
-    std::optional<Hypothesis> best;
-    for (int rows = -most_late; rows <= most_late; ++rows) {
-      if (rows == 0 || rows == late.rows) continue;
-      std::optional<Hypothesis> other = doubted.late(input, rows);
-      if (!other) continue;
-      other->gain = explanation.gain_of(*other);
-      if (other->gain > (best ? best->gain : 0)) best = std::move(other);
+    const std::vector<Observations> mended = without_change(observations, hypothesis.change, 1);
+    const ModelValues values = doubted.fitted_values(mended);
+    const Cost cost = cost_under(doubted.posterior.prior(), values);
+    const double left = cost(mended);
+    if (auto better = better_one(doubted, observations, hypothesis, left, cost)) {
+      // a factor may change with each fit by more than its deviation
+      if (k + 1 < most_fits || hypothesis.kind != Hypothesis::Kind::factor) {
+        hypothesis = *std::move(better);
+        continue;
+      }
     }
-    if (!best) {
-      if (std::abs(late.rows) == most_late || !explanation.is_sound()) return std::nullopt;
-      late.gain = gain;
-      return late;
-    }
-    late = *std::move(best);
+    const bool sound = is_sound(doubted, observations, mended, inputs, hypothesis, values, cost);
+    return Explanation{std::move(hypothesis), left, sound};
   }
   return std::nullopt;
 }
 
-// What explains the data that deny an input; nothing: neither a delay, nor a factor, nor an exchange with another input.
+// What explains the data that deny an input: of a delay, a factor, an exchange with another input, and a factor of the known force
+// that which leaves the least cost. Nothing where that is not sound.
 std::optional<Hypothesis> explanation_of(const Doubted& doubted, const std::vector<Observations>& observations,
                                          const InputEffect& input, std::vector<Hypothesis> doubts,
                                          const std::vector<InputEffect>& others, double as_logged, const Cost& cost) {
   for (const InputEffect& other : others) {
     if (input.is_of_one_log || other.is_of_one_log || other.input == input.input) continue;
+    if (input.input == known_force || other.input == known_force) {
+      const std::vector<Hypothesis> of_other = doubts_of(other, observations, as_logged, cost);
+      if (!of_other.empty()) doubts.push_back(of_other.front());
+      continue;
+    }
     if (std::ranges::find(doubts, other.input, &Hypothesis::other) != doubts.end()) continue;
     std::optional<Hypothesis> exchanged = doubted.exchanged(input.input, other.input);
     if (!exchanged) continue;
@@ -352,19 +410,20 @@ std::optional<Hypothesis> explanation_of(const Doubted& doubted, const std::vect
     if (exchanged->gain > least_gain) doubts.push_back(*std::move(exchanged));
   }
   std::ranges::sort(doubts, std::ranges::greater(), &Hypothesis::gain);
+  std::optional<Explanation> best;
   bool is_late_asked = false;
   for (const Hypothesis& one : doubts) {
+    if (one.kind == Hypothesis::Kind::late && std::exchange(is_late_asked, true)) continue;
     try {
-      if (one.kind != Hypothesis::Kind::late) {
-        if (Explanation(doubted, observations, one).is_sound()) return one;
-      } else if (!std::exchange(is_late_asked, true)) {
-        if (auto delay = sound_delay(doubted, observations, input.input, one)) return delay;
-      }
+      std::optional<Explanation> explanation = fitted_anew(doubted, observations, others, one);
+      if (explanation && (!best || explanation->left < best->left)) best = std::move(explanation);
     } catch (const NumericalError&) {
       continue;  // what cannot be fitted explains nothing
     }
   }
-  return std::nullopt;
+  if (!best || !best->is_sound) return std::nullopt;
+  best->hypothesis.gain = as_logged - best->left;
+  return std::move(best->hypothesis);
 }
 
 // The same, of which nothing was measured in one log, or in all others.
@@ -450,8 +509,15 @@ void note_unexplained(const std::vector<std::string>& inputs, double gain, std::
 void note_doubts(const Doubted& doubted, std::vector<Observations> observations, std::vector<InputEffect> inputs, bool asks_logs,
                  std::vector<std::string>& notes) {
   const Cost cost = cost_under(doubted.posterior.prior(), doubted.posterior.values());
+  constexpr double several = 10;  // times what stays unexplained
+  struct Claim {
+    std::string name;
+    Hypothesis explanation;
+    double gain;  // before latents and noise were fitted anew
+  };
+  std::vector<Claim> claims;
   std::vector<std::string> unexplained;
-  double unexplained_gain = 0;
+  double unexplained_gain = 0, least_claim = 0;
   for (;;) {
     const double as_logged = cost(observations);
     if (std::isinf(as_logged)) throw NumericalError("some of the rows alone have no posterior mean");
@@ -478,25 +544,43 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
     } else if (of_input >= 0) {
       const InputEffect input = inputs[static_cast<std::size_t>(of_input)];
       const auto explanation = explanation_of(doubted, observations, input, doubts, inputs, as_logged, cost);
+      const auto about = std::ranges::find(inputs, explanation ? explanation->input : input.input, &InputEffect::input);
       if (explanation) {
-        const std::string instead =
-            doubted.held.empty() ? ""
-                                 : fmt::format("; or {}, held by a bound or a prior, is wrong", fmt::join(doubted.held, ", "));
-        notes.push_back(
-            fmt::format("warning: the data contradict the input {}: they are most likely if {}, by {:.2g} in log likelihood. {}",
-                        input.name, explanation->text, explanation->gain, explanation->cause + instead));
+        claims.push_back({about->input == input.input ? input.name : about->name, *explanation, gain});
       } else {
+        least_claim = std::max(least_claim, several * gain);
+      }
+      if (!explanation && input.input != known_force) {
         unexplained.push_back(input.name);
         unexplained_gain = std::max(unexplained_gain, gain);
       }
-      observations = without_change(observations, explanation ? explanation->change : doubts.front().change, 1);
+      if (explanation || input.input != known_force)
+        observations = without_change(observations, explanation ? explanation->change : doubts.front().change, 1);
       // what else is said of it is said of an input that acts so
-      const auto is_said = [&](int one) { return one == input.input || (explanation && one == explanation->other); };
+      const auto is_said = [said = about->input, &explanation](int one) {
+        return one == said || (explanation && one == explanation->other);
+      };
       std::erase_if(inputs, [&](const InputEffect& one) { return is_said(one.input); });
       for (InputEffect& one : inputs) std::erase_if(one.exchanged, [&](const Hypothesis& with) { return is_said(with.other); });
     } else {
       break;
     }
+  }
+  // what is wrong elsewhere may be all that speaks for a claim
+  for (const Claim& claim : claims) {
+    if (claim.gain < least_claim) {
+      if (claim.explanation.input != known_force) {
+        unexplained.push_back(claim.name);
+        unexplained_gain = std::max(unexplained_gain, claim.gain);
+      }
+      continue;
+    }
+    const std::string instead =
+        doubted.held.empty() ? "" : fmt::format("; or {}, held by a bound or a prior, is wrong", fmt::join(doubted.held, ", "));
+    notes.push_back(
+        fmt::format("warning: the data contradict the {}: they are most likely if {}, by {:.2g} in log likelihood. {}",
+                    (claim.explanation.input == known_force ? "" : "input ") + claim.name, claim.explanation.text,
+                    claim.explanation.gain, claim.explanation.cause + instead));
   }
   note_unexplained(unexplained, unexplained_gain, notes);
 }
@@ -556,6 +640,9 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
     for (std::size_t g = 0; g < all.size(); ++g) {
       if (all[g].view().is_of_ddq()) inputs.push_back(inputs[k].in_log(g));
     }
+  }
+  if (!inputs.empty()) {
+    if (auto effect = doubted.force()) inputs.push_back({known_force, "known force without inputs", *std::move(effect)});
   }
   std::vector<Observations> observations = some;
   if (asks_logs) note_lost_inputs(posterior, observations, fitted_values, notes);

@@ -12,7 +12,8 @@ namespace gp2 {
 // Fits the hyperparameters to some of the data.
 using FittedValues = std::function<ModelValues(const std::vector<Observations>&)>;
 
-// Inputs that never move, inputs that act otherwise than the model says, in all logs or in one, and logs that contradict each other.
+// Inputs that never move, inputs that act otherwise than the model says, in all logs or in one, a known force that does, and logs that
+// contradict each other.
 // @param lines          per observations: the line in its log of each state; empty where it is not known
 // @param held  names of parameters that a bound or a prior holds against the data: if wrong, inputs seem wrong
 void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, const std::vector<std::string>& held,

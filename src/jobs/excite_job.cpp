@@ -241,17 +241,6 @@ class Search {
  private:
   using Clock = std::chrono::steady_clock;
 
-  // why a motion could not be integrated, without the options of simulate, which excite has not
-  [[nodiscard]] static std::string failure_text(std::string text) {
-    constexpr std::string_view of_simulate = "loosen the tolerances, or allow more steps (`max_steps`)";
-    if (const std::size_t at = text.find(of_simulate); at != std::string::npos) {
-      text.replace(
-          at, of_simulate.size(),
-          fmt::format("use more `rows` ({} steps of the integrator are allowed per row), or smaller limits", most_steps_per_row));
-    }
-    return text;
-  }
-
   [[nodiscard]] Candidate integrated(VectorXd coefficients) const {
     SimulateJob job = motion_;
     job.options.inputs = inputs_.at(coefficients);
@@ -259,7 +248,7 @@ class Search {
     try {
       out.motion = run_simulation(job, stop_).front();
     } catch (const NumericalError& error) {
-      if (stop_ == nullptr || !*stop_) out.failure = failure_text(error.what());
+      if (stop_ == nullptr || !*stop_) out.failure = error.what();
       return out;
     }
     out.violation = 0;
@@ -494,12 +483,17 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
   of_motion.times = VectorXd::LinSpaced(request.n_rows, t_start, t_start + request.duration);
   of_motion.max_steps = most_steps_per_row * request.n_rows;
   SimulateJob motion = prepare_simulation(driven, information.posterior(), of_motion);
+  motion.options.max_steps_advice =
+      fmt::format("use more `rows` ({} steps of the integrator are allowed per row), or smaller limits", most_steps_per_row);
   motion.motions.front().multipliers = nullptr;
   require_start_within(motion.start, limits);
   out.notes = motion.notes;
   if (posterior.n_states() > n_states(posterior.observations())) {
     out.notes.push_back(fmt::format("present standard deviations are computed from {} of the {} rows of the fit",
                                     n_states(posterior.observations()), posterior.n_states()));
+  }
+  if (std::ranges::any_of(driven.actuators, &Actuator::is_estimated)) {
+    out.notes.emplace_back("delays and lags count as known: what their errors add to those of parameters is left out");
   }
 
   Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics, driven.actuators),

@@ -27,7 +27,7 @@
 #include "inference/inducing_summary.hpp"
 #include "jobs/doubts.hpp"
 #include "jobs/fit_notes.hpp"
-#include "jobs/read_observations.hpp"
+#include "jobs/repeated_rows.hpp"
 
 namespace gp2 {
 
@@ -187,9 +187,10 @@ void note_load_without_force(const FitProblem& problem, std::vector<std::string>
 FitJob job_of(FitRequest request, FitProblem problem) {
   // a file of starting values may change: the record has the values
   if (!request.start.empty()) {
-    read_start(request.start, request.max_iterations, problem);
+    read_start(request.start, request.max_iterations, request.model.actuators, problem);
     request.start.file.clear();
     for (const Hyperparameter& h : problem.hyperparameters) request.start.values[h.name] = h.value;
+    for (const Parameter& late : problem.late) request.start.values[late.name] = late.value;
   }
   FitJob job;
   job.checkpoint = request.checkpoint;
@@ -352,8 +353,13 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   const FittedValues fitted_values = [&](const std::vector<Observations>& some) {
     return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
   };
-  tests.run("the inputs and the logs",
-            [&] { add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, notes); });
+  // a column that is not the rate of another makes sound inputs look wrong
+  const bool has_wrong_rate = std::ranges::any_of(
+      job.notes, [](const std::string& note) { return note.find(" is not the rate of ") != std::string::npos; });
+  if (!has_wrong_rate) {
+    tests.run("the inputs and the logs",
+              [&] { add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, notes); });
+  }
   const std::string correlated = scores ? correlated_text(scores->residuals) : "";
   if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: standard deviations are too small", correlated));
   tests.add_notes(notes);
@@ -421,12 +427,16 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
 
 // The job with its delays and lags estimated, and known from then on.
 FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
-  if (job.problem.late.empty() || job.options.max_iterations == 0) return job;
-  FitOptions options = job.options;
-  options.stop = stop;
-  job.actuators = estimate_actuators(job.problem, options);
+  if (job.problem.late.empty()) return job;
   std::map<std::string, double> values;
-  for (const ActuatorEstimate& one : job.actuators) values.emplace(one.name, one.value);
+  if (job.options.max_iterations > 0) {
+    FitOptions options = job.options;
+    options.stop = stop;
+    job.actuators = estimate_actuators(job.problem, options);
+    for (const ActuatorEstimate& one : job.actuators) values.emplace(one.name, one.value);
+  } else {
+    for (const Parameter& late : job.problem.late) values.emplace(late.name, late.value);
+  }
   set_values(values, job.file.model.actuators);
   FitProblem& problem = job.problem;
   for (std::size_t g = 0; g < problem.observations.size(); ++g) {
@@ -434,9 +444,10 @@ FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
   }
   problem.late.clear();
   // hyperparameters start anew, by the spread of what acts
-  const FitRequest request = request_of(job.file);
+  FitRequest request = request_of(job.file);
   problem.hyperparameters = starting_hyperparameters(job.file.model, problem, request.problem);
-  if (!request.start.empty()) read_start(request.start, request.max_iterations, problem);
+  for (const auto& [name, value] : values) request.start.values.erase(name);
+  if (!request.start.empty()) read_start(request.start, request.max_iterations, job.file.model.actuators, problem);
   return job;
 }
 

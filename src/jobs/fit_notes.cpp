@@ -235,13 +235,15 @@ bool has_far_values(const CrossValidation& of) {
 // the fit is too sure of itself. What the model lacks is taken up between rows that are known, and told by stretches that are not.
 bool predicts_stretches_worse(const CrossValidation& of) {
   constexpr double several = 3, twice = 2;  // times the noise; the error of single values
-  constexpr double somewhat = 1.3, low_coverage = 0.9;
+  constexpr double somewhat = 1.3, low_coverage = 0.9, full_coverage = 0.95;
   if (!of.stretches) return false;
   const Evaluation::Part &values = of.values, &stretches = *of.stretches;
   const double error = stretches.nrmse;
   // of the spread; a fit that knows how far it errs there may err more
-  const double worth_a_word = stretches.coverage95 >= 0.95 ? 0.1 : 0.01;
+  const bool is_sure = stretches.coverage95 < full_coverage;
+  const double worth_a_word = is_sure ? 0.01 : 0.1;
   if (error > std::max({several * of.nrmse_of_noise, twice * values.nrmse, worth_a_word})) return true;
+  if (is_sure && stretches.n >= enough_rows && error > twice * std::max(of.nrmse_of_noise, values.nrmse)) return true;
   if (error > somewhat * std::max(of.nrmse_of_noise, values.nrmse) && stretches.coverage95 < low_coverage) {
     return stretches.n >= enough_rows;
   }
@@ -256,11 +258,14 @@ bool predicts_rows_badly(const CrossValidation& of) {
          std::ranges::none_of(of.residuals, &TrainingResidual::is_too_large);
 }
 
-// Whether what the fit leaves open is more than a sound model would of as many rows: it errs even between them, and far more beyond.
-bool denies_model(const CrossValidation& of, double error) {
-  constexpr double between = 2, beyond = 5, worth_a_warning = 0.1;  // times the noise; of the spread
-  return of.values.n >= enough_rows && of.values.nrmse > between * of.nrmse_of_noise &&
-         error > std::max(beyond * of.nrmse_of_noise, worth_a_warning);
+// Whether what the fit leaves open is more than a sound model would of as many rows: it errs even between them, and far more beyond; or
+// it errs far beyond the noise where it is too sure of itself.
+bool denies_model(const CrossValidation& of, const Evaluation::Part& left_out) {
+  constexpr double between = 2, beyond = 5, far_beyond = 10, worth_a_warning = 0.1;  // times the noise; of the spread
+  constexpr double low_coverage = 0.9;
+  if (of.values.n < enough_rows || !(left_out.nrmse > worth_a_warning)) return false;
+  return (of.values.nrmse > between * of.nrmse_of_noise && left_out.nrmse > beyond * of.nrmse_of_noise) ||
+         (left_out.coverage95 < low_coverage && left_out.nrmse > far_beyond * of.nrmse_of_noise);
 }
 
 // What a model may have wrong that rows left out are predicted badly.
@@ -272,6 +277,7 @@ std::string causes_text(const Prior& prior) {
   if (std::ranges::any_of(prior.latents, &Latent::is_potential))
     causes.emplace_back("a force that dissipates, which a potential does not");
   causes.emplace_back("a force that no latent stands for");
+  causes.emplace_back("a clock that is not that of the samples");
   return fmt::format(
       "Something differs from the model ({}), or the rows are too few, or of one motion, for what the model must learn",
       fmt::join(causes, ", "));
@@ -298,7 +304,7 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
   if (const LittlePredicted little = little_predicted(cross_validation); little.part != nullptr) {
     constexpr double useless = 0.9;
     const double error = little.part->nrmse;
-    const bool is_warning = error >= useless || denies_model(cross_validation, error);
+    const bool is_warning = error >= useless || denies_model(cross_validation, *little.part);
     const char* const than_mean = error >= 1         ? ", worse than their mean would"
                                   : error >= useless ? ", hardly better than their mean would"
                                                      : "";
@@ -309,7 +315,7 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
     notes.push_back(fmt::format(
         "{}stretches of the log that were left out are predicted worse than single values: nrmse {:.2g}, not {:.2g}, of which "
         "noise is {:.2g}; the 95 % intervals contain {:.0f} %. {}",
-        denies_model(cross_validation, stretches.nrmse) ? "warning: " : "", stretches.nrmse, cross_validation.values.nrmse, noise,
+        denies_model(cross_validation, stretches) ? "warning: " : "", stretches.nrmse, cross_validation.values.nrmse, noise,
         100 * stretches.coverage95, causes_text(prior)));
   } else if (predicts_rows_badly(cross_validation)) {
     notes.push_back(

@@ -13,7 +13,9 @@
 #include "gp2/error.hpp"
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
+#include "jobs/acting_states.hpp"
 #include "jobs/fit_notes.hpp"
+#include "jobs/log_columns.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
@@ -71,6 +73,14 @@ FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& log
     problem.observations.push_back(read_log(logged, log, options, rows, problem.notes));
     problem.lines.push_back(std::move(rows.lines));
     problem.systems.push_back(nullptr);
+  }
+  for (const Actuator& actuator : model.actuators) {
+    for (const Parameter& one : {actuator.delay, actuator.lag}) {
+      const bool is_asked_for = options.estimate ? std::ranges::count(*options.estimate, one.name) > 0 : one.estimate;
+      if (is_asked_for)
+        problem.notes.push_back(
+            fmt::format("{} is not estimated by a baseline: it is that of the model, {:.6g} s", one.name, one.value));
+    }
   }
   problem.prior_options.baseline = standardised_by(problem.observations, problem.prior, *options.baseline);
   problem.prior = make_prior(model, problem.prior_options);
@@ -521,21 +531,45 @@ void add_vanishing_notes(const Posterior& posterior, std::vector<std::string>& n
 
 }  // namespace
 
-void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
+void read_start(const NamedNumbers& start, int max_iterations, const std::vector<Actuator>& actuators, FitProblem& problem) {
   const std::string source = start.file.empty() ? "`start`" : start.file;
+  std::map<std::string, double> known;  // of the model, which this fit may hold
+  for (const Actuator& actuator : actuators) {
+    for (const Parameter& one : {actuator.delay, actuator.lag}) known[one.name] = one.value;
+  }
+  // of an estimated delay or lag; those that are held have the model's
+  const auto read_late = [&](const std::string& name, double value) {
+    const auto late = std::ranges::find(problem.late, name, &Parameter::name);
+    if (late == problem.late.end()) return false;
+    const auto [lower, upper] = Actuator::bounds(*late);
+    if (!(value >= lower && value <= upper)) {
+      throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", source, name, value, lower, upper));
+    }
+    late->value = value;
+    return true;
+  };
   const auto read = [&] {
+    std::map<std::string, double> others;
     if (start.file.empty()) {
-      set_start_values(start.values, source, problem.hyperparameters);
-      return;
+      std::map<std::string, double> values = start.values;
+      for (const auto& [name, value] : known) {
+        if (auto of_actuator = values.extract(name)) others.insert(std::move(of_actuator));
+      }
+      set_start_values(values, source, problem.hyperparameters);
+    } else {
+      std::vector<std::string> names;
+      for (const auto& [name, value] : known) names.push_back(name);
+      others = read_start_values(start.file, problem.hyperparameters, names);
     }
     const System& system = *problem.prior.system;
-    for (const Hyperparameter& h : read_start_values(start.file, problem.hyperparameters)) {
-      const int index = system.parameter_index(h.name);
-      if (index < 0 || system.parameter_values()[index] == h.value) continue;
+    for (int k = 0; k < std::ssize(system.parameters()); ++k)
+      known[system.parameters()[static_cast<std::size_t>(k)].name] = system.parameter_values()[k];
+    for (const auto& [name, value] : others) {
+      if (read_late(name, value) || !known.contains(name) || known.at(name) == value) continue;
       problem.notes.push_back(
           fmt::format("warning: {}: {} = {:.6g} is not taken: this fit does not estimate it and has {:.6g} of "
                       "the model",
-                      source, h.name, h.value, system.parameter_values()[index]));
+                      source, name, value, known.at(name)));
     }
   };
   if (max_iterations > 0) {

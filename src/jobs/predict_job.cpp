@@ -15,7 +15,8 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/cross_validation.hpp"
 #include "jobs/fit_notes.hpp"
-#include "jobs/read_observations.hpp"
+#include "jobs/log_columns.hpp"
+#include "jobs/reading_notes.hpp"
 
 namespace gp2 {
 

@@ -86,6 +86,7 @@ class RateRows {
     lengths_ = (t.tail(n) - t.head(n)).transpose();
     usual_length_ = median({lengths_.begin(), lengths_.end()});
     changes_ = (columns.value.tail(n) - columns.value.head(n)).transpose();
+    if (columns.may_jump) leave_out_impacts();
     constexpr double turn = 2 * std::numbers::pi, noise = 0.5;
     if (!columns.is_angle || columns.value.maxCoeff() - columns.value.minCoeff() > turn + noise) return;
     for (double& change : changes_) change = std::remainder(change, turn);
@@ -121,7 +122,17 @@ class RateRows {
   }
 
  private:
-  /// NaN where the log pauses, or begins anew
+  /// Steps that the rate is much farther from explaining than it is from most others. A wrong rate is far from all.
+  void leave_out_impacts() {
+    constexpr double far = 4;
+    const auto rate = columns_.rates[columns_.own].transpose().array();
+    const Index n = changes_.size();
+    const ArrayXd unexplained = (changes_ - 0.5 * (rate.head(n) + rate.tail(n)) * lengths_).abs();
+    const ArrayXd known = unexplained.isNaN().select(0.0, unexplained);
+    lengths_ = (known > far * most_are_below(known)).select(not_a_number, lengths_);
+  }
+
+  /// NaN where the log pauses, or begins anew, and at impacts
   [[nodiscard]] double length(Index row) const {
     return lengths_[row] > 1.5 * usual_length_ || !(lengths_[row] > 0) ? not_a_number : lengths_[row];
   }
@@ -307,11 +318,12 @@ std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, c
     return true;
   };
   const std::vector<std::string> acceleration_names = system.acceleration_names();
+  const bool may_jump = system.has_conditional_constraints();
   for (std::size_t j = 0; j < q.size(); ++j) {
     const Coordinate& coordinate = system.coordinates()[j];
     // a velocity that is wrong says nothing of the acceleration
     if (!add_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
-      add_if_wrong({t, velocities[j], dq[j], false, ddq, acceleration_names, j});
+      add_if_wrong({t, velocities[j], dq[j], false, ddq, acceleration_names, j, may_jump});
   }
   return notes;
 }

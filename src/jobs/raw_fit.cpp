@@ -15,7 +15,8 @@
 #include "gp2/jobs/resample.hpp"
 #include "gp2/simulation/projected_states.hpp"
 #include "inference/inducing_summary.hpp"
-#include "jobs/read_observations.hpp"
+#include "jobs/acting_inputs.hpp"
+#include "jobs/series_checks.hpp"
 
 namespace gp2 {
 
@@ -362,7 +363,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     MatrixXd states;  // of all rows, with what acts
   };
   std::optional<Learned> last;
-  const auto learn_from = [&](const LearnedLog& before) {
+  const auto learn_from_rows = [&](const LearnedLog& before) {
     FitRequest quick = before.request(request, log.name());
     const CsvTable whole = *quick.problem.commands;
     quick.model.actuators = actuators;
@@ -374,6 +375,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     actuators = fit.file.model.actuators;
     last = {fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole)};
   };
+  const auto learn_from = [&](const LearnedLog& before) { with_warnings(before.data.notes, [&] { learn_from_rows(before); }); };
   const auto smoothed_by_fit_to = [&](const LearnedLog& before) {
     learn_from(before);
     return with_rows(derive(request.model, log, smoothing, left_out_accelerations(last->posterior, last->lines, last->states)));

@@ -94,14 +94,6 @@ void unwrap(Eigen::Ref<Eigen::RowVectorXd, 0, Eigen::InnerStride<>> angles) {
   }
 }
 
-// A report lets nobody choose tolerances and the number of steps.
-std::string without_options(std::string why) {
-  const std::size_t advice = why.find("loosen the tolerances");
-  if (advice == std::string::npos) return why;
-  why.erase(why.find_last_of(":;", advice));
-  return why + "; gp2 simulate goes on";
-}
-
 // A motion at all times, NaN beyond what it reached; empty where it did not begin.
 struct Reached {
   MatrixXd states, multipliers;
@@ -125,7 +117,7 @@ Reached follow(SimulateJob job, std::size_t motion) {
   try {
     return reached(run_simulation(job).front(), "");
   } catch (const UnfinishedMotion& unfinished) {
-    return reached(unfinished.motions.front(), without_options(unfinished.what()));
+    return reached(unfinished.motions.front(), unfinished.what());
   }
 }
 
@@ -199,6 +191,7 @@ class Roll {
     request.max_steps = std::max(RolloutLimits::most_steps / posterior_.n_components(), RolloutLimits::least_steps);
     request.n_samples = samples;
     SimulateJob job = prepare_simulation(asked_, posterior_, request);
+    job.options.max_steps_advice = "gp2 simulate goes on, with more steps";  // a report lets nobody choose their number
     // states hold what acts, not what was commanded
     if (layout.nu > 0) {
       MatrixXd acting = followed.middleRows(layout.u(0), layout.nu);

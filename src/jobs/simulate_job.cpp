@@ -14,7 +14,7 @@
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/model_motion.hpp"
-#include "jobs/read_observations.hpp"
+#include "jobs/log_columns.hpp"
 #include "simulation/contacts.hpp"
 
 namespace gp2 {

@@ -21,8 +21,9 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/fit_notes.hpp"
+#include "jobs/log_columns.hpp"
 #include "jobs/observation_noise.hpp"
-#include "jobs/read_observations.hpp"
+#include "jobs/repeated_rows.hpp"
 
 namespace gp2 {
 
@@ -312,7 +313,7 @@ std::vector<std::string> measured_somewhere(std::vector<std::string> names, cons
                                             const UpdateRequest& request) {
   const auto is_empty = [&](const std::string& column) {
     const int at = reader.table().find(column);
-    return at >= 0 && is_empty_column(reader.table(), at);
+    return at >= 0 && reader.table().is_empty(at);
   };
   std::erase_if(names, [&](const std::string& name) {
     const bool lacks_stddevs = !request.noise_stddev && is_empty(reader.stddev_column(name));

@@ -8,6 +8,7 @@
 
 #include "gp2/error.hpp"
 #include "mechanics/differences.hpp"
+#include "mechanics/largest_rank.hpp"
 
 namespace gp2 {
 
@@ -170,6 +171,13 @@ std::vector<bool> CallableSystem::reads(SystemPart part) const {
   }
   // without residuals nothing is read
   return residual_labels_.empty() ? std::vector<bool>(residuals_read_.size(), false) : residuals_read_;
+}
+
+int CallableSystem::largest_rank() const {
+  // a lock could be held by a thread whose function waits for this one, as for Python's; each thread finds the same
+  int rank = largest_rank_;
+  if (rank < 0) largest_rank_ = rank = internal::find_largest_rank(*this);
+  return rank;
 }
 
 }  // namespace gp2

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <exception>
 #include <limits>
 #include <map>
 #include <mutex>
@@ -17,6 +18,7 @@
 #include "base/parallel.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/differences.hpp"
 #include "mechanics/in_blocks.hpp"
@@ -80,6 +82,8 @@ LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& 
 }
 
 namespace {
+
+bool has_expressions(const System& system) { return dynamic_cast<const SymbolicSystem*>(&system) != nullptr; }
 
 VectorXd eigenvalues_of(const MatrixXd& M) {
   return Eigen::SelfAdjointEigenSolver<MatrixXd>(M, Eigen::EigenvaluesOnly).eigenvalues();
@@ -207,8 +211,10 @@ void check_coriolis(const System& system, const Ref<const MatrixXd>& states, con
   if (!is_zero) return;
   findings.push_back(
       {Level::warning,
-       "mass matrix: it changes with the motion, but no part of the force is quadratic in the velocities: the Coriolis and "
-       "centrifugal forces are missing; write coriolis = true in [mechanics]"});
+       fmt::format(
+           "mass matrix: it changes with the motion, but no part of the force is quadratic in the velocities: the Coriolis "
+           "and centrifugal forces are missing; {}",
+           has_expressions(system) ? "write coriolis = true in [mechanics]" : "add them to F")});
 }
 
 // M is symmetric, and definite or completed by A
@@ -516,14 +522,80 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
                                   worst > 1e-3 ? " (largest for '" + worst_label + "')" : "")});
 }
 
+// What a part of a system gives at states, by quantity.
+std::vector<MatrixXd> evaluate_part(const System& system, SystemPart part, const MatrixXd& states,
+                                    const Ref<const VectorXd>& parameters) {
+  if (part == SystemPart::residuals) return {system.residuals(states, parameters)};
+  SystemValues values;
+  system.evaluate_into(states, parameters, values);
+  if (part == SystemPart::force) return {values.force};
+  return {values.mass, values.constraint_matrix, values.constraint_vector};
+}
+
+// Functions declare what they read; what they read besides has no derivative in the state. Expressions show it themselves.
+void check_reads(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                 std::vector<Finding>& findings) {
+  if (has_expressions(system)) return;
+  constexpr Index max_states = 50;
+  const Index stride = (states.cols() + max_states - 1) / max_states;
+  const MatrixXd here = states(Eigen::all, Eigen::seq(0, states.cols() - 1, stride));
+  const auto largest = [](const MatrixXd& values) {
+    return values.size() == 0 ? 0 : values.array().isFinite().select(values.array().abs(), 0).maxCoeff();
+  };
+  const std::vector<MatrixXd> mechanics = evaluate_part(system, SystemPart::mechanics, here, parameters);
+  const double size_of_M = largest(mechanics[0]), size_of_A = largest(mechanics[1]);
+  struct Part {
+    SystemPart part;
+    const char *text, *list;
+    std::vector<double> sizes;  // of each quantity, beside its own: of terms that may cancel in it
+  };
+  for (const Part& one : {Part{SystemPart::mechanics, "M, A or b depend", "mechanics_reads", {0, 0, size_of_A}},
+                          Part{SystemPart::force, "F depends", "force_reads", {size_of_M}},
+                          Part{SystemPart::residuals, "the residuals depend", "residuals_read", {size_of_A}}}) {
+    const std::vector<bool> reads = system.reads(one.part);
+    const std::vector<MatrixXd> expected = evaluate_part(system, one.part, here, parameters);
+    const auto changes = [&](const MatrixXd& moved) {
+      try {
+        const std::vector<MatrixXd> got = evaluate_part(system, one.part, moved, parameters);
+        for (std::size_t k = 0; k < got.size(); ++k) {
+          constexpr double rounding = 1e-10;
+          const double size = one.sizes[k] + largest(expected[k]) + largest(got[k]);
+          const auto before = expected[k].array(), after = got[k].array();
+          const auto are_close = after == before || (after - before).abs() <= rounding * size;
+          if (!(are_close || (after.isNaN() && before.isNaN())).all()) return true;
+        }
+        return false;
+      } catch (const std::exception&) {
+        return true;  // to refuse a value is to read it
+      }
+    };
+    std::vector<std::string> missing;
+    for (Index k = 0; k < here.rows(); ++k) {
+      if (reads[static_cast<std::size_t>(k)]) continue;
+      MatrixXd moved = here;
+      for (double& x : moved.row(k).reshaped()) x = std::isfinite(x) ? x + 0.7 * (1 + std::abs(x)) : 0.3;
+      if (changes(moved)) missing.push_back(system.state_names()[static_cast<std::size_t>(k)]);
+    }
+    if (missing.empty()) continue;
+    findings.push_back(
+        {Level::warning, fmt::format("declared reads: {} on {}, which {} (in Python reads) lacks: derivatives in the state are "
+                                     "wrong, and a log need not have such columns; add the names",
+                                     one.text, fmt::join(missing, ", "), one.list)});
+  }
+}
+
 }  // namespace
 
 std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                   int n_threads) {
+  system.require_states(states);
+  system.require_parameters(parameters);
+  if (states.cols() == 0) throw InputError("check_system: there are no states");
   std::vector<Finding> findings;
   if (!check_mechanics(system, states, parameters, n_threads, findings)) return findings;
   check_parameter_derivatives(system, states, parameters, n_threads, findings);
   check_motion(system, states, parameters, n_threads, findings);
+  check_reads(system, states, parameters, findings);
   return findings;
 }
 

@@ -266,6 +266,12 @@ class RowResiduals {
   ConstraintResidual sums_;              // of the others; squares where a root mean square is wanted
 };
 
+// Of all accelerations at all states, or empty: not known.
+void require_stddev(const char* what, const System& system, const Ref<const MatrixXd>& states,
+                    const Ref<const MatrixXd>& stddev) {
+  if (stddev.size() > 0) require_shape(what, stddev, system.nq(), states.cols());
+}
+
 }  // namespace
 
 std::vector<ConstraintViolation> constraint_violations(const System& system, const Ref<const MatrixXd>& states,
@@ -318,7 +324,7 @@ std::vector<ConstraintViolation> constraint_violations(const System& system, con
     const OfResidual& one = all[k];
     ConstraintViolation& violation = violations.emplace_back();
     violation = {not_a_number, not_a_number, not_a_number, 0, labels[k].text};
-    if (!one.is_measured) continue;
+    if (!one.is_measured || states.cols() == 0) continue;
     double scale = 0;
     for (int j = 0; j < system.nq(); ++j) {
       if (one.weights[j] > 0) scale += one.weights[j] * moved(labels[k].velocity, j);
@@ -342,6 +348,9 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
                                                   const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& accelerations,
                                                   const Ref<const MatrixXd>& stddev) {
+  system.require_states(states);
+  require_shape("dependent_columns: accelerations", accelerations, system.nq(), states.cols());
+  require_stddev("dependent_columns: stddev", system, states, stddev);
   if (system.nc() == 0) return std::nullopt;
   if (accelerations.hasNaN()) {
     const std::vector<int> complete = complete_states(accelerations);
@@ -434,6 +443,9 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
                                                      const Ref<const VectorXd>& parameters,
                                                      const Ref<const MatrixXd>& accelerations,
                                                      const Ref<const MatrixXd>& stddev) {
+  system.require_states(states);
+  require_shape("constraint_residuals: accelerations", accelerations, system.nq(), states.cols());
+  require_stddev("constraint_residuals: stddev", system, states, stddev);
   std::vector<RowResiduals> rows(static_cast<std::size_t>(system.nc()), RowResiduals(states.cols()));
   in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
     const SystemValues values = system.evaluate(block, parameters);
@@ -446,7 +458,7 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
           if (a == 0) continue;
           one.r += a * accelerations(j, state);
           one.size += std::abs(a * accelerations(j, state));
-          one.variance += a * a * stddev(j, state) * stddev(j, state);
+          one.variance += stddev.size() == 0 ? not_a_number : a * a * stddev(j, state) * stddev(j, state);
         }
         // a row that vanishes says nothing of ddq
         if (!std::isfinite(one.r) || one.variance == 0) continue;
@@ -469,6 +481,11 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
                                 const std::vector<int>& stated, bool estimates_noise) {
   system.require_states(states);
   require_shape("check_data: accelerations", accelerations, system.nq(), states.cols());
+  require_stddev("check_data: stddev", system, states, stddev);
+  for (const int row : stated) {
+    if (row >= 0 && row < system.nq()) continue;
+    throw InputError(fmt::format("check_data: stated: there are the rows 0 … {}, got {}", system.nq() - 1, row));
+  }
   const bool estimates =
       std::any_of(system.parameters().begin(), system.parameters().end(), [](const auto& one) { return one.estimate; });
   std::vector<Finding> findings;
@@ -508,7 +525,7 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
   };
   // which of them a fit observes may change from row to row
   const auto most_stated = [&] { return (!stddev(stated, Eigen::all).array().isNaN()).colwise().count().maxCoeff(); };
-  if (rows && !stated.empty() && most_stated() <= std::ssize(*rows)) {
+  if (rows && !stated.empty() && stddev.size() > 0 && most_stated() <= std::ssize(*rows)) {
     findings.push_back(
         {Level::good,
          fmt::format(

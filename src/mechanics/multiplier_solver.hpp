@@ -61,6 +61,9 @@ class MultiplierSolver {
   bool run(const Matrix& G, const Vector& d, const Motion& motion, double tau) {
     constexpr int most = 40;
     constexpr double enough = 64 * std::numeric_limits<double>::epsilon();
+    constexpr double small =
+        1e-10;  // large forces that cancel in G ā round more than λ does: steps then stop getting smaller here
+    double before = std::numeric_limits<double>::infinity();
     for (int step = 0; step < most; ++step) {
       motion(lambda_, a_bar_, slope_);
       is_finite_ = a_bar_.allFinite() && slope_.allFinite();
@@ -76,7 +79,10 @@ class MultiplierSolver {
       lambda_ -= change_;
       // where D is nearly singular steps do not get as small as what is left
       const double size = size_ + lambda_.norm();
-      if (change_.norm() <= enough * size || residual_.norm() <= 0.1 * enough * size) return lambda_.allFinite();
+      const double change = change_.norm();
+      const bool is_rounding = change <= small * size && change >= 0.5 * before;
+      if (change <= enough * size || residual_.norm() <= 0.1 * enough * size || is_rounding) return lambda_.allFinite();
+      before = change;
     }
     return false;
   }

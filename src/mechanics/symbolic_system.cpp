@@ -4,13 +4,10 @@
 #include <array>
 
 #include <fmt/format.h>
-#include <Eigen/QR>
 
-#include "base/not_a_number.hpp"
-#include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
-#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "mechanics/largest_rank.hpp"
 #include "symbolic/graph.hpp"
 #include "symbolic/state_derivatives.hpp"
 
@@ -170,64 +167,6 @@ std::vector<std::string> conditions_of(const SymbolicSystem::Definition& definit
   return conditions;
 }
 
-// Moves a state onto constraints of positions, by Newton's method with the least change. False where this does not converge.
-bool meet_constraints(const SymbolicSystem& system, const VectorXd& parameters, MatrixXd& state) {
-  constexpr int max_iterations = 50;
-  constexpr double redundant = 1e-8, met = 1e-8;  // of the largest singular value; of the lengths
-  const Index nq = system.nq();
-  auto q = state.col(0).head(nq), dq = state.col(0).segment(nq, nq);
-  MatrixXd A;
-  VectorXd c;
-  const auto step_from = [&](int residual) -> VectorXd {  // the first of each constraint is c, the second ċ
-    c = system.residuals(state, parameters).reshaped(2, system.nc()).row(residual).transpose();
-    A = system.evaluate(state, parameters).A(0);
-    if (!c.allFinite() || !A.allFinite()) return VectorXd::Constant(nq, not_a_number);
-    Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
-    decomposition.setThreshold(redundant);
-    return -decomposition.compute(A).solve(c);
-  };
-  bool has_converged = false;
-  for (int iteration = 0; iteration < max_iterations && !has_converged; ++iteration) {
-    const VectorXd step = step_from(0);
-    if (!step.allFinite()) return false;
-    q += step;
-    has_converged = step.norm() <= 1e-12 * (1 + q.norm());
-  }
-  // constraints that contradict each other have a nearest state too
-  if (!has_converged || (c.array().abs() > met * (1 + q.norm()) * A.rowwise().norm().array()).any()) return false;
-  dq += step_from(1);
-  return dq.allFinite();
-}
-
-int find_largest_rank(const SymbolicSystem& system) {
-  const int nc = system.nc();
-  const auto is_of_positions = [](const ConstraintRow& row) {
-    return row.level == ConstraintLevel::position && row.condition.empty();
-  };
-  if (nc < 2 || !std::ranges::all_of(system.definition().constraints, is_of_positions)) return nc;
-  constexpr int n_starts = 16, enough = 4;  // states: a mechanism may be singular at some
-  RandomStream random(0);
-  int n_found = 0, largest = 0;
-  for (int start = 0; start < n_starts && n_found < enough && largest < nc; ++start) {
-    MatrixXd state(system.layout().size(), 1);
-    for (double& entry : state.reshaped()) entry = random.normal();
-    // nor may rows follow from others at the model's own parameters alone, as where some are 0
-    VectorXd parameters = system.parameter_values();
-    for (double& one : parameters) {
-      const double change = start % 2 == 0 ? 0 : 0.1 * random.normal();
-      one += (one == 0 ? 1 : one) * change;
-    }
-    if (!meet_constraints(system, parameters, state)) continue;
-    const SystemValues values = system.evaluate(state, parameters);
-    const UdwadiaKalaba projection(values.M(0), values.A(0), values.b(0));
-    if (!projection.motion_is_determined()) continue;
-    if (projection.is_contradictory(values.F(0))) return nc;
-    ++n_found;
-    largest = std::max(largest, projection.rank());
-  }
-  return n_found < enough || largest == 0 ? nc : largest;
-}
-
 }  // namespace
 
 // The derivatives are taken in a graph of their own: that of the definition may be growing elsewhere.
@@ -265,7 +204,7 @@ SymbolicSystem::SymbolicSystem(Definition definition)
     }
   }
   residuals_ = Tape(residuals, tape_inputs);
-  largest_rank_ = find_largest_rank(*this);
+  largest_rank_ = internal::find_largest_rank(*this);
 
   state_tape_ = std::make_unique<StateTape>();
   state_tape_->inputs = state_tape_->graph->copy(tape_inputs);

@@ -12,6 +12,7 @@
 
 #include "base/decompositions.hpp"
 #include "base/parallel.hpp"
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"
@@ -195,6 +196,9 @@ void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const Matrix
                             int largest_rank) {
   const Index nq = M.rows();
   const Index nc = A.rows();
+  require_shape("UdwadiaKalaba: M", M, nq, nq);
+  require_shape("UdwadiaKalaba: A", A, nc, nq);
+  require_shape("UdwadiaKalaba: b", b, nc, 1);
   rank_ = n_zero_rows_ = 0;
   inconsistency_ = size_of_b_ = 0;
   const double pivot = factorise_mass(M, A);
@@ -312,6 +316,7 @@ void UdwadiaKalaba::invert_R_transposed() {
 }
 
 bool UdwadiaKalaba::is_contradictory(const Ref<const VectorXd>& F, double rounding) const {
+  require_shape("UdwadiaKalaba::is_contradictory: F", F, mass_.rows(), 1);
   if (!(inconsistency_ > std::max(consistency_tolerance * size_of_b_, rounding))) return false;
   // as large as |C⁻¹F| where M is diagonal, and never much larger
   double size_of_force = 0;
@@ -328,8 +333,14 @@ MatrixXd UdwadiaKalaba::solve_mass(const Ref<const MatrixXd>& v) const {
 }
 
 void UdwadiaKalaba::solve_mass_in_place(Ref<MatrixXd> v) const {
+  require_shape("UdwadiaKalaba::solve_mass: v", v, mass_.rows(), v.cols());
   solve_lower(mass_factor_, v);
   solve_upper(mass_factor_, v);
+}
+
+void UdwadiaKalaba::write_L(Ref<MatrixXd> L) const {
+  require_shape("UdwadiaKalaba::write_L: L", L, L_unit_.rows(), L_unit_.cols());
+  L = L_unit_ * row_scale_.asDiagonal();
 }
 
 MatrixXd UdwadiaKalaba::L() const { return L_unit_ * row_scale_.asDiagonal(); }
@@ -367,6 +378,8 @@ void UdwadiaKalaba::write_multipliers_of_force(MatrixXd& K, Workspace& workspace
 }
 
 MatrixXd UdwadiaKalaba::differentiate_mass(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {
+  require_shape("UdwadiaKalaba::differentiate_mass: dM", dM, mass_.rows(), mass_.cols());
+  require_shape("UdwadiaKalaba::differentiate_mass: dA", dA, row_mass_.size(), mass_.cols());
   if (!mass_is_singular()) return dM;
   MatrixXd d = dM;
   for (Index k = 0; k < row_mass_.size(); ++k) {
@@ -385,6 +398,8 @@ VectorXd UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar) const {
 }
 
 void UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar, Ref<VectorXd> ddq, Workspace& workspace) const {
+  require_shape("UdwadiaKalaba::constrain: a_bar", a_bar, T_.cols(), 1);
+  require_shape("UdwadiaKalaba::constrain: ddq", ddq, T_.rows(), 1);
   ddq = Lb_;
   ddq.noalias() += T_ * a_bar;
   VectorXd& residual = workspace.rows_;
@@ -395,6 +410,9 @@ void UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar, Ref<VectorXd> dd
 
 UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA,
                                                        const Ref<const VectorXd>& db) const {
+  require_shape("UdwadiaKalaba::differentiate: dM", dM, mass_.rows(), mass_.cols());
+  require_shape("UdwadiaKalaba::differentiate: dA", dA, row_scale_.size(), mass_.cols());
+  require_shape("UdwadiaKalaba::differentiate: db", db, row_scale_.size(), 1);
   // any fixed scaling of the rows gives the same T and L b, so the unit rows serve: dA → D dA, db → D db. Since M L = AᵀΛ,
   // ΛA = (M L)ᵀ and Λb = (M L)ᵀ L b
   const MatrixXd dA_unit = row_scale_.asDiagonal() * dA;

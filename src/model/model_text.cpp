@@ -1,7 +1,11 @@
 #include "model/model_text.hpp"
 
+#include <algorithm>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
 
 namespace gp2 {
 
@@ -58,6 +62,32 @@ std::string range_text(const std::string& name, const Latent::Range& range) {
   return entries.empty() ? "" : fmt::format("{} = {}", name, table(entries));
 }
 
+// @throws InputError where the text would say less than the spec.
+void require_words_for(const LatentSpec& spec) {
+  const auto fail = [&](const std::string& what) { throw InputError(fmt::format("latent '{}': {}", spec.name, what)); };
+  if (spec.base == Latent::Base::admissible && !spec.is_potential) {
+    fail("a model has no word for the base admissible; make the prior alone, by make_prior, or take another base");
+  }
+  const auto require_both_ends = [&](const std::string& name, const Latent::Range& range) {
+    if ((range.lower > 0) == (range.upper > 0)) return;
+    fail(fmt::format("a model holds both bounds or none, but {} has the {} one alone; give both", name,
+                     range.lower > 0 ? "lower" : "upper"));
+  };
+  require_both_ends("lengthscale", spec.lengthscale);
+  require_both_ends("signal_stddev", spec.signal_stddev);
+  for (const auto& [feature, range] : spec.lengthscales)
+    require_both_ends(fmt::format("the lengthscale of '{}'", feature), range);
+  // beside single lengthscales whether directions share them follows from the kernel
+  const bool is_default = !spec.per_direction || (!spec.kernel.empty() && !*spec.per_direction);
+  const bool has_single =
+      std::ranges::any_of(spec.lengthscales, [](const auto& one) { return !range_text(one.first, one.second).empty(); });
+  if (!has_single || spec.is_potential || is_default) return;
+  fail(
+      fmt::format("a model cannot hold per_direction = {} beside lengthscales of single features; leave one of them out, or make "
+                  "the prior alone, by make_prior",
+                  *spec.per_direction));
+}
+
 std::string ranges_text(const LatentSpec& spec) {
   std::vector<std::string> lines = {range_text("lengthscale", spec.lengthscale), range_text("signal_stddev", spec.signal_stddev)};
   std::vector<std::string> each;
@@ -85,6 +115,7 @@ std::string directions_text(const LatentSpec& spec) {
 }
 
 std::string latent_text(const LatentSpec& spec) {
+  require_words_for(spec);
   const std::string features = quoted_list(spec.features);
   return fmt::format("\n[[latent]]\nname = {}\n{}features = {}\n", quoted(spec.name),
                      spec.kernel.empty() ? "" : fmt::format("kernel = {}\n", quoted(spec.kernel)),

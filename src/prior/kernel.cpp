@@ -219,7 +219,9 @@ Kernel Kernel::parse(std::string_view text, std::span<const std::string> feature
 
 MatrixXd Kernel::evaluate(const Ref<const MatrixXd>& left, const Ref<const MatrixXd>& right,
                           const Ref<const VectorXd>& values) const {
-  require_shape("Kernel::evaluate: the points on the right", right, right.rows(), left.cols());
+  require_shape("Kernel::evaluate: the points on the left", left, left.rows(), n_features());
+  require_shape("Kernel::evaluate: the points on the right", right, right.rows(), n_features());
+  require_shape("Kernel::evaluate: values", values, std::ssize(parameters()), 1);
   const KernelColumns columns(*this, left, values);
   KernelColumns::Workspace workspace;
   VectorXd point, column(columns.n_rows());

@@ -1,6 +1,7 @@
 #include "prior/make_prior.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <utility>
 
@@ -327,9 +328,30 @@ std::vector<std::string> entries_read_by_latents(const Prior& prior) {
   return entries;
 }
 
+// numbers that would be passed over in silence, or fail when the prior is fitted
+void require_sound_range(const LatentSpec& spec, const std::string& name, const Latent::Range& range) {
+  const auto fail = [&](const std::string& text) { throw InputError(fmt::format("latent '{}': {}: {}", spec.name, name, text)); };
+  for (const double value : {range.initial, range.lower, range.upper, range.median, range.log_stddev}) {
+    if (!(value >= 0) || !std::isfinite(value))
+      fail(fmt::format("its numbers must be positive, or 0 for the default, got {}", value));
+  }
+  if (range.upper > 0 && range.lower > range.upper) {
+    fail(fmt::format("the lower bound {} is above the upper one {}", range.lower, range.upper));
+  }
+  if (range.initial > 0 && (range.initial < range.lower || (range.upper > 0 && range.initial > range.upper))) {
+    fail(fmt::format("it starts at {}, outside its bounds", range.initial));
+  }
+  if ((range.median > 0) != (range.log_stddev > 0)) fail("median and log_stddev belong together; give both or none");
+}
+
 // what a model file's reader asks of a [[latent]], where there is no file
 void require_well_formed(const LatentSpec& spec, const System& system) {
   const auto fail = [&](const std::string& text) { throw InputError(fmt::format("latent '{}': {}", spec.name, text)); };
+  require_sound_range(spec, "lengthscale", spec.lengthscale);
+  require_sound_range(spec, "signal_stddev", spec.signal_stddev);
+  for (const auto& [feature, range] : spec.lengthscales) {
+    require_sound_range(spec, fmt::format("the lengthscale of '{}'", feature), range);
+  }
   if (spec.features.empty()) fail("it needs at least one feature; code needs a name for each of its numbers");
   if (spec.is_potential && (spec.feature_code || spec.direction_code)) {
     fail("a potential needs features that are expressions, so that they can be differentiated");

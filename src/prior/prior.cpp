@@ -118,7 +118,11 @@ std::vector<bool> Prior::reads() const {
 }
 
 MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Ref<const MatrixXd>& states) {
-  const Latent& of = prior.latents.at(latent);
+  if (latent >= prior.latents.size()) {
+    throw InputError(fmt::format("evaluate_features: the prior has {} latents, numbered from 0, got the latent {}",
+                                 prior.latents.size(), latent));
+  }
+  const Latent& of = prior.latents[latent];
   if (!of.features) throw InputError(fmt::format("prior: the latent '{}' has no features", of.name));
   const MatrixXd features = of.features->evaluate(states, VectorXd());
   if (const std::optional<Entry> entry = first_not_finite(features)) {

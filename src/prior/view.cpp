@@ -5,7 +5,9 @@
 #include <numeric>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
+#include "base/shape.hpp"
 #include "gp2/error.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/pushed_system.hpp"
@@ -54,6 +56,11 @@ void require_other_system(const Prior& fitted, const OtherSystem& other) {
                       "make_other_system makes one that fits",
                       its.name, mine.name));
     }
+    if (its.feature_names == mine.feature_names) continue;
+    throw InputError(
+        fmt::format("view: the latent '{}' of its other system has the features {}, '{}' of the fitted one {}; "
+                    "make_other_system makes one that fits",
+                    its.name, fmt::join(its.feature_names, ", "), mine.name, fmt::join(mine.feature_names, ", ")));
   }
   if (other.shared.size() != there.parameters().size()) {
     throw InputError(fmt::format("view: its other system has {} parameters, but shared has {} numbers", there.parameters().size(),
@@ -106,6 +113,7 @@ bool reads_loads(const Prior& prior) {
 }
 
 View pushed(const Prior& fitted, View view, const VectorXd& push) {
+  require_shape("pushed: push", push, prior_of(fitted, view).system->nc(), 1);
   std::vector<int> own(fitted.system->parameters().size());
   std::iota(own.begin(), own.end(), 0);
   OtherSystem there = view.other_system ? *view.other_system : OtherSystem{fitted, std::move(own)};

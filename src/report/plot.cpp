@@ -165,17 +165,18 @@ std::string plot(const LearnedCurve& curve, const Model& model) {
   const Axis up = axis_over(low.minCoeff(), high.maxCoeff(), 0.08, bottom, top);
   const std::string name = force.names[static_cast<std::size_t>(curve.row)];
   const std::string label = model.labelled(name.substr(0, name.find('@')));
+  const std::string rows_text = fmt::format("{}{}", force.data.size(), force.are_all_rows ? "" : " of the");
   const std::string heading = shortened(fmt::format("{} – {}", force.latent, model.system->name()), 62);
 
   std::string svg = fmt::format(
       "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{0}\" height=\"{1}\" viewBox=\"0 0 {0} {1}\" role=\"img\" "
       "font-family=\"system-ui, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif\" font-size=\"13\" fill=\"#59636b\">\n"
       "<title>{2}</title>\n"
-      "<desc>What was learned along {3}, with its 95 % band: from {4} to {5}. Marks at the foot are the {6} rows it was learned "
+      "<desc>What was learned along {3}, with its 95 % band: from {4} to {5}. Marks at the foot are {6} rows it was learned "
       "from.</desc>\n"
       "<rect width=\"{0}\" height=\"{1}\" fill=\"#ffffff\"/>\n",
       width, height, markup_text(heading), markup_text(force.along), number_text(mean.minCoeff()), number_text(mean.maxCoeff()),
-      force.data.size());
+      rows_text);
   // grid and numbers
   for (const double value : ticks(up.low, up.high, 6)) {
     svg += fmt::format(
@@ -209,7 +210,7 @@ std::string plot(const LearnedCurve& curve, const Model& model) {
       "band</text><path d=\"M{4:.0f},48v-8m5,8v-8m7,8v-8\" stroke=\"#59636b\" stroke-opacity=\"0.55\"/><text x=\"{5:.0f}\" "
       "y=\"46\">{6} rows "
       "of training</text>\n",
-      left, left + 26, left + 96, left + 122, left + 208, left + 228, force.data.size());
+      left, left + 26, left + 96, left + 122, left + 208, left + 228, rows_text);
   svg += fmt::format("<text x=\"{:.0f}\" y=\"{:.0f}\" text-anchor=\"middle\" fill=\"#1d2327\">{}</text>\n", (left + right) / 2,
                      bottom + 48, markup_text(model.labelled(force.along)));
   svg += fmt::format(

@@ -69,6 +69,16 @@ MatrixXd gaps_of(const System& system, const std::vector<Contact>& contacts, Mat
   return system.residuals(states, parameters)(gap_residuals(system, contacts), Eigen::all);
 }
 
+namespace {
+
+double checked_restitution(double value, const Contact& contact) {
+  if (value >= 0 && value <= 1) return value;
+  throw InputError(fmt::format("simulate: the restitution of the contact of row {} of A must lie between 0 and 1, got {}",
+                               contact.row + 1, value));
+}
+
+}  // namespace
+
 Contacts::Contacts(const System& system, const VectorXd& parameters, const SimulateOptions& options)
     : system_(system),
       parameters_(parameters),
@@ -76,7 +86,9 @@ Contacts::Contacts(const System& system, const VectorXd& parameters, const Simul
       contacts_(options.contacts),
       residuals_(gap_residuals(system, options.contacts)),
       shortest_flight_(options.shortest_flight),
-      is_closed_(contacts_.size(), false) {}
+      is_closed_(contacts_.size(), false) {
+  for (const Contact& contact : contacts_) checked_restitution(contact.restitution, contact);
+}
 
 void Contacts::mark(VectorXd& state, const std::vector<bool>& closed) const {
   for (std::size_t k = 0; k < contacts_.size(); ++k) state[layout_.u(contacts_[k].input)] = closed[k] ? 1 : 0;
@@ -241,7 +253,7 @@ void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::ve
     hit[contact] = !is_closed_[contact] && gaps.value[k] < -gaps.margin[k] && gaps.rate[k] < 0;
     if (!hit[contact]) continue;
     const Contact& of = contacts_[contact];
-    restitution[k] = of.restitution_at ? of.restitution_at(state) : of.restitution;
+    restitution[k] = of.restitution_at ? checked_restitution(of.restitution_at(state), of) : of.restitution;
   }
   if (std::find(hit.begin(), hit.end(), true) == hit.end()) {
     release(state, acceleration, events);

@@ -11,11 +11,18 @@
 #include "mechanics/known_multipliers.hpp"
 #include "mechanics/multiplier_solver.hpp"
 #include "mechanics/pushed_system.hpp"
+#include "prior/make_prior.hpp"
 
 namespace gp2 {
 
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+
+namespace {
+
+Eigen::Index n_soft_rows(const System& system) { return (system.constraint_noise().array() > 0).count(); }
+
+}  // namespace
 
 void require_truth(const Model& model) {
   if (model.truth.empty()) {
@@ -24,7 +31,9 @@ void require_truth(const Model& model) {
   }
 }
 
-ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters_(model.system->parameter_values()) {
+ModelMotion::ModelMotion(const Model& model) : system_(model.system) {
+  require_system(system_);
+  parameters_ = system_->parameter_values();
   std::vector<Expression> all = model.truth;
   all.insert(all.end(), model.truth_force.begin(), model.truth_force.end());
   const Multipliers load = multipliers_in(all, *system_);
@@ -40,6 +49,7 @@ ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters
 }
 
 ModelMotion ModelMotion::pushed(const VectorXd& push) const {
+  require_shape("ModelMotion::pushed: push", push, system_->nc(), 1);
   ModelMotion motion = *this;
   motion.system_ = std::make_shared<const PushedSystem>(system_, push);
   return motion;
@@ -123,6 +133,7 @@ MatrixXd ModelMotion::unconstrained_acceleration(const Eigen::Ref<const MatrixXd
 }
 
 MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states, const MatrixXd& slip) const {
+  if (slip.size() > 0) require_shape("ModelMotion::acceleration: slip", slip, n_soft_rows(*system_), states.cols());
   MatrixXd accelerations(system_->nq(), states.cols());
   const auto fault = for_each_mechanics(
       *system_, states, parameters_, /*n_threads=*/1, [&](Eigen::Index first, const MechanicsBatch& mechanics) {
@@ -160,8 +171,7 @@ MatrixXd ModelMotion::multipliers(const Eigen::Ref<const MatrixXd>& states) cons
 MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states, const MatrixXd& slip) {
   require_truth(model);
   if (slip.size() > 0) {
-    const Eigen::Index n_soft = (model.system->constraint_noise().array() > 0).count();
-    require_shape("true_acceleration: slip", slip, n_soft, states.cols());
+    require_shape("true_acceleration: slip", slip, n_soft_rows(*model.system), states.cols());
   }
   MatrixXd accelerations = ModelMotion(model).acceleration(states, slip);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {

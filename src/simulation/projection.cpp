@@ -146,6 +146,14 @@ void ConstraintProjection::fail(const Level& level, const VectorXd& state) const
       state[system_.layout().t()], system_.residual_labels()[static_cast<std::size_t>(worst)].text, all[worst]));
 }
 
+bool ConstraintProjection::has_redundant_rows(VectorXd state) const {
+  if (system_.nc() < 2) return false;
+  apply(state);
+  const MechanicsBatch mechanics = evaluate_mechanics(system_, state, parameters_);
+  return !mechanics.projections.empty() && mechanics.projections[0].motion_is_determined() &&
+         ranks_of(system_, mechanics)[0].rank < system_.nc();
+}
+
 double ConstraintProjection::largest_residual(const Ref<const MatrixXd>& states, bool velocity) const {
   const std::vector<int>& rows = velocity ? velocity_.residuals : position_.residuals;
   if (rows.empty()) return 0;

@@ -23,6 +23,9 @@ class ConstraintProjection {
   /// @throws NumericalError, naming the time and the residual, when a residual is not brought to rounding.
   bool apply(Eigen::VectorXd& state) const;
 
+  /// Whether some rows of A follow from the others; they show it on the constraints, which the state is put onto.
+  [[nodiscard]] bool has_redundant_rows(Eigen::VectorXd state) const;
+
   /// The largest |residual| over all position rows, or all velocity rows, at N states; 0 when there is none.
   [[nodiscard]] double largest_residual(const Eigen::Ref<const Eigen::MatrixXd>& states, bool velocity) const;
 

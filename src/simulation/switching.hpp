@@ -34,7 +34,8 @@ class Switching {
   /// States beside a surface are put onto the constraints too: of redundant rows b means nothing off them, at rest least of all.
   void put_onto(std::function<void(Eigen::VectorXd& state)> constraints) { constraints_ = std::move(constraints); }
 
-  [[nodiscard]] bool is_empty() const { return functions_.size() == 0; }
+  [[nodiscard]] int size() const { return functions_.size(); }
+  [[nodiscard]] bool is_empty() const { return size() == 0; }
   [[nodiscard]] bool is_sliding() const;
   /// Whether the motion slides on a surface, or creeps from one.
   [[nodiscard]] bool is_guided() const;

@@ -369,8 +369,8 @@ void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> accelera
   if (!found) found = solve(dependent);
   if (!found) {
     throw NumericalError(
-        fmt::format("system '{}': the measured positions do not meet the constraints at t = {:.6g}; are their units and zeros "
-                    "those of the model?",
+        fmt::format("system '{}': the measured positions do not meet the constraints at t = {:.6g}; are their units, signs and "
+                    "zeros, and the lengths, those of the model?",
                     system_.name(), state[system_.layout().t()]));
   }
   state.head(2 * nq) = found->z.head(2 * nq);

@@ -97,8 +97,20 @@ LeastSquares solve(const Prior& prior, const std::vector<const Observations*>& g
         variance = (v.cwiseAbs().array() > 1e-6).select(std::numeric_limits<double>::infinity(), variance);
       }
     }
-    out.value += scale.cwiseProduct(step);
     out.stddev = scale.cwiseProduct(variance.cwiseSqrt());
+    // far from the solution a whole step may lead farther away, or to where a residual that is known here has no value
+    const auto size_of = [&](const MatrixXd& all) {
+      return (weight.asDiagonal() * MatrixXd(residuals.array().isFinite().select(all, 0.0))).squaredNorm();
+    };
+    const auto part = [&](double share) { return VectorXd(out.value + share * scale.cwiseProduct(step)); };
+    double share = 1;
+    constexpr double least = 1e-3;
+    for (; share > least; share /= 2) {
+      parameters(indices) = part(share);
+      if (size_of(residuals_at(system, groups, parameters)) <= size_of(residuals)) break;
+    }
+    if (share <= least) break;
+    out.value = part(share);
     if (!out.value.allFinite() || step.cwiseAbs().maxCoeff() < 1e-12) break;
   }
   return out;
@@ -118,7 +130,7 @@ void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& obs
     indices.push_back(h.index);
   }
   for (Hyperparameter& h : hyperparameters) {
-    if (h.is_system_parameter() && !moves_the_system(prior, groups, parameters, h.index)) silent.push_back(&h);
+    if (h.is_system_parameter() && !h.is_fixed() && !moves_the_system(prior, groups, parameters, h.index)) silent.push_back(&h);
   }
   if (silent.empty() || groups.empty()) return;
   const bool has_residuals = !prior.system->residual_labels().empty();

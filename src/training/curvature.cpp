@@ -189,7 +189,7 @@ VectorXd scales_of_parameters(const Objective& objective, const VectorXd& x, con
   if (is_set(stop) || !std::isfinite(objective(x, &gradient, workspace))) return scales;
   for (Index k = 0; k < x.size() && !is_set(stop); ++k) {
     const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
-    if (!h.is_system_parameter()) continue;
+    if (!h.is_system_parameter() || h.is_fixed()) continue;
     constexpr double step = 1e-5;  // of the box, away from the nearer bound
     VectorXd there = x;
     there[k] += x[k] < 0.5 ? step : -step;

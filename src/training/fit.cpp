@@ -76,6 +76,10 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   require_hyperparameters(prior, observations, hyperparameters);
   require_starts(hyperparameters);
   const bool is_part = options.n_train > 0 && options.n_train < n_states(observations);
+  if (has_sums(observations) && (options.n_inducing > 0 || is_part)) {
+    throw InputError(
+        "fit: observations that have sums over states are learned from all together; leave out n_inducing and n_train");
+  }
   FitReport report = [&] {
     if (options.n_inducing > 0) return trained_through_points(prior, observations, hyperparameters, options);
     const std::vector<Observations> part = is_part ? evenly(observations, options.n_train) : std::vector<Observations>();

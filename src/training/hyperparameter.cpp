@@ -105,7 +105,8 @@ void Hyperparameter::ask_for_gradient(Likelihood::Options& options) const {
 CoordinateMap Hyperparameter::map() const {
   if (positive) return {};
   if (size > 0) return {false, 0, size};
-  return {false, lower, upper - lower};
+  const double unit_of_held = lower == 0 ? 1 : std::abs(lower);
+  return {false, lower, is_fixed() ? unit_of_held : upper - lower};
 }
 
 double Hyperparameter::value_at(double x) const { return std::clamp(map().value(x), lower, upper); }
@@ -157,9 +158,7 @@ void require_places(const Prior& prior, const std::vector<Observations>& observa
 }
 
 void require_bounds(const Hyperparameter& h) {
-  // in a box without width only a logarithm has a coordinate
-  const bool in_order = h.positive || h.size > 0 ? h.lower <= h.upper : h.lower < h.upper;
-  if (in_order && is_possible(h, h.lower) && is_possible(h, h.upper)) return;
+  if (h.lower <= h.upper && is_possible(h, h.lower) && is_possible(h, h.upper)) return;
   throw InputError(fmt::format("hyperparameter '{}': its bounds must be finite{}, the lower one below the upper, got [{}, {}]",
                                h.name, h.positive ? " and positive" : "", h.lower, h.upper));
 }

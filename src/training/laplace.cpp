@@ -154,9 +154,16 @@ double stddev_of_parameter(const FitReport& report, std::size_t k) {
   return std::hypot(stddev_under_actuators(report, k), std::sqrt(covariance_by_actuators(report, k, k)));
 }
 
+void require_hyperparameter(const char* function, const FitReport& report, std::size_t k) {
+  if (k < report.hyperparameters.size()) return;
+  throw InputError(fmt::format("{}: the fit has {} hyperparameters, numbered from 0, got the number {}", function,
+                               report.hyperparameters.size(), k));
+}
+
 }  // namespace
 
 ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k) {
+  require_hyperparameter("parameter_uncertainty", report, k);
   const auto at = static_cast<Index>(k);
   const double stddev = stddev_of_parameter(report, k);
   if (!draws_know_parameters(report) || !report.draws->is_drawn(at) || !std::isfinite(stddev)) return {.stddev = stddev};
@@ -166,6 +173,7 @@ ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t 
 }
 
 double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l) {
+  for (const std::size_t one : {k, l}) require_hyperparameter("parameter_correlation", report, one);
   const auto a = static_cast<Index>(k), b = static_cast<Index>(l);
   const bool is_of_draws = draws_know_parameters(report);
   if (!std::isfinite(stddev_under_actuators(report, k)) || !std::isfinite(stddev_under_actuators(report, l))) return not_a_number;

@@ -104,7 +104,7 @@ class TrainingThroughPoints {
     options.improved = nullptr;
     for (Hyperparameter& h : hyperparameters) {
       if (!h.is_system_parameter() && h.kind != Hyperparameter::Kind::noise_stddev) continue;
-      if (!h.positive && h.size == 0) h.size = h.upper - h.lower;  // its unit, which a box without width has none of
+      if (!h.positive && h.size == 0) h.size = h.upper - h.lower;  // its unit stays
       h.lower = h.upper = h.value;
     }
     try {

@@ -226,6 +226,33 @@ ddq = 0.05
   EXPECT_THAT(desk.run("gp2 check free.toml --data log.csv").out, HasSubstr(stuck));
 }
 
+TEST(Check, NamesTheRowsInWhichAChannelIsStuck) {
+  const Desk desk;
+  desk.write("mass.toml", R"toml(
+coordinates = ["x"]
+inputs = ["u"]
+[mechanics]
+mass = [["1"]]
+force = ["u"]
+[[latent]]
+features = ["dx"]
+directions = "force"
+)toml");
+  const auto log_with = [&](int first, int n) {
+    std::string text = "t,x,dx,u,ddx\n";
+    for (int i = 0; i < 150; ++i) {
+      const double t = 0.05 * i, logged = i >= first && i < first + n ? 0.05 * first : t;
+      text += fmt::format("{},{},{},{},{}\n", t, std::sin(2 * t), 2 * std::cos(2 * logged), -4 * std::sin(2 * t),
+                          -4 * std::sin(2 * t) + 0.01 * std::sin(100.0 * i));
+    }
+    desk.write("log.csv", text);
+    return desk.done("gp2 check mass.toml --data log.csv").out;
+  };
+  EXPECT_THAT(log_with(0, 0), Not(HasSubstr("stuck")));
+  EXPECT_THAT(log_with(60, 15),
+              HasSubstr("dx is the same in data rows 61 to 75, while the system moves: was its channel stuck?"));
+}
+
 /// A bead on a wire z = x²/2 beside a belt that rubs, whose potential is told.
 std::string bead_with(const std::string& potential) {
   return R"toml(

@@ -1,9 +1,11 @@
 #include "gp2/inference/likelihood.hpp"
 
+#include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
 #include "inference/problems.hpp"
+#include "input_error.hpp"
 
 namespace gp2 {
 namespace {
@@ -152,6 +154,28 @@ TEST(LikelihoodTest, IsInfiniteWhereAParameterMakesTheMassMatrixIndefinite) {
     EXPECT_THROW(Likelihood(p.prior, p.observations, p.values, options), InputError);
     EXPECT_THROW(Posterior(p.prior, p.observations, p.values), InputError);
   }
+}
+
+TEST(LikelihoodTest, RefusesANoiseOrParametersThatItReducedOnce) {
+  const Problem p = test::problems(9, likelihood_seed).front();
+  ModelValues noisier = p.values, moved = p.values;
+  noisier.noise_stddev[0] *= 2;
+  moved.parameters[0] *= 1.01;
+  const auto refusal = [&](const Likelihood::Options& options, const ModelValues& values) {
+    Likelihood::Workspace workspace;
+    return test::input_error_of(
+        [&] { Likelihood(p.prior, p.observations, p.values, options).evaluate(values, nullptr, workspace); });
+  };
+  EXPECT_THAT(refusal({}, noisier), testing::HasSubstr("values: noise_stddev of a likelihood that gives no derivative in it must "
+                                                       "be that which it was made with"));
+  EXPECT_THAT(refusal({}, moved),
+              testing::HasSubstr("values: parameters of a likelihood that gives no derivative in them must be "
+                                 "those that it was made with"));
+  EXPECT_THAT(refusal({{}, true}, moved), testing::HasSubstr("values: parameters of a likelihood"));
+  // where one asks for them they are those of `values`
+  Likelihood::Workspace workspace;
+  EXPECT_EQ(Likelihood(p.prior, p.observations, p.values, {{}, true}).evaluate(noisier, nullptr, workspace),
+            Likelihood(p.prior, p.observations, noisier, {}).evaluate(noisier, nullptr, workspace));
 }
 
 TEST(LikelihoodTest, IsInfiniteWhereTheCovarianceCannotBeFactored) {

@@ -9,6 +9,8 @@
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/predictor.hpp"
+#include "gp2/simulate.hpp"
+#include "gp2/simulation/model_motion.hpp"
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
 #include "input_error.hpp"
@@ -120,6 +122,9 @@ TEST(Requirements, AnotherSystemHasTheLatentsOfThePrior) {
   changed.shared.clear();
   expect(changed, "shared has 0 numbers");
   changed = *other;
+  changed.prior.latents[0].feature_names[3] = "z";
+  expect(changed, "view: the latent 'unconstrained acceleration' of its other system has the features q1, q2, q3, z, ");
+  changed = *other;
   changed.prior.system = nullptr;
   expect(changed, "prior: it has no system");
 }
@@ -145,6 +150,47 @@ TEST(Requirements, StatesAreThoseOfTheSystem) {
               HasSubstr("parameters, numbered from 0, got the number 99"));
   EXPECT_THAT(input_error_of([&] { static_cast<void>(evaluate_features(s.prior, 0, few)); }),
               AllOf(HasSubstr("a state of"), Not(HasSubstr("tape"))));
+}
+
+TEST(Requirements, StatesRowsLatentsAndHyperparametersAreThoseThatThereAre) {
+  const Surface s;
+  const Observations& group = s.observations.front();
+  const VectorXd stddev = group.noise().stddev();
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(evaluate_features(s.prior, 9, s.data.states)); }),
+            "evaluate_features: the prior has 1 latents, numbered from 0, got the latent 9");
+  for (const int i : {-1, 7}) {
+    EXPECT_EQ(input_error_of([&] { static_cast<void>(group.noise_at(stddev, i)); }),
+              "observations: 1 states from number " + std::to_string(i) + " on are asked for, of 7");
+  }
+  for (const int k : {-1, 3}) {
+    expect_refusal({{"states_noise", [&] { static_cast<void>(group.states_noise(k)); }},
+                    {"measured_scales", [&] { static_cast<void>(group.measured_scales(k)); }}},
+                   "observations: there are the rows 0 … 2, got " + std::to_string(k));
+  }
+  const VectorXd many = VectorXd::Ones(4);
+  expect_refusal({{"noise_at", [&] { static_cast<void>(group.noise_at(many, 0)); }},
+                  {"noise_of_values", [&] { static_cast<void>(group.noise_of_values(many)); }},
+                  {"usual_noise", [&] { static_cast<void>(group.usual_noise(many)); }}},
+                 "observations: the noise of each row must be 3 × 1, got 4 × 1");
+  FitReport report;
+  report.hyperparameters = s.hyperparameters;
+  const std::size_t n = report.hyperparameters.size();
+  const std::string text =
+      "the fit has " + std::to_string(n) + " hyperparameters, numbered from 0, got the number " + std::to_string(n);
+  EXPECT_EQ(input_error_of([&] { parameter_uncertainty(report, n); }), "parameter_uncertainty: " + text);
+  EXPECT_EQ(input_error_of([&] { parameter_correlation(report, 0, n); }), "parameter_correlation: " + text);
+  EXPECT_EQ(input_error_of([&] { parameter_correlation(report, n, 0); }), "parameter_correlation: " + text);
+}
+
+TEST(Requirements, APushAndASlipAreOfTheConstraints) {
+  const Surface s;
+  const ModelMotion motion(s.model);
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(motion.pushed(VectorXd::Ones(2))); }),
+            "ModelMotion::pushed: push must be 1 × 1, got 2 × 1");
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(motion.acceleration(s.data.states, MatrixXd::Ones(1, 7))); }),
+            "ModelMotion::acceleration: slip must be 0 × 7, got 1 × 7");
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(pushed(s.prior, s.ddq, VectorXd::Ones(2))); }),
+            "pushed: push must be 1 × 1, got 2 × 1");
 }
 
 TEST(Requirements, AStateThatIsNotKnownIsNamedByItsEntry) {
@@ -281,6 +327,8 @@ TEST(Requirements, APriorIsWhole) {
   const std::string no_system = "make_prior: there is no system; a model that was never read, or was moved away, has none";
   EXPECT_EQ(input_error_of([] { make_prior(nullptr, {}); }), no_system);
   EXPECT_EQ(input_error_of([] { make_prior(Model()); }), no_system);
+  EXPECT_EQ(input_error_of([] { const ModelMotion motion{Model()}; }), no_system);
+  EXPECT_EQ(input_error_of([] { model_acceleration(Model()); }), no_system);
   EXPECT_EQ(input_error_of([] { static_cast<void>(Model::from_code(nullptr, {})); }), no_system);
 
   Prior prior;

@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 #include "inference/sampling.hpp"
 #include "input_error.hpp"
@@ -158,6 +159,13 @@ TEST(Sums, SayWhatIsWrongWithThem) {
            "of the same row before it");
   }
   EXPECT_THROW(static_cast<void>(group.with_sums({good}).take({0})), InputError);
+  FitOptions through_points, on_some;
+  through_points.n_inducing = 5;
+  on_some.n_train = 2;
+  for (const FitOptions& options : {through_points, on_some}) {
+    EXPECT_EQ(test::input_error_of([&] { fit(p.prior, {group.with_sums({good})}, {}, options); }),
+              "fit: observations that have sums over states are learned from all together; leave out n_inducing and n_train");
+  }
 }
 
 }  // namespace

@@ -123,6 +123,34 @@ TEST(ActuatorFit, AFitKeepsItsEstimatesInItsFileAndIsDoneAgainFromThere) {
   EXPECT_EQ(again.file.model.actuators[0].delay.value, read.model.actuators[0].delay.value);
 }
 
+TEST(ActuatorFit, AStartHasDelaysAndLagsToo) {
+  const CsvTable log = late_cart_log(0.02, 0.05, 100, 4, 3);
+  const FitOutcome fit = fit_of(estimated, log);
+  const TemporaryFolder folder;
+  fit.file.write(folder / "late.json");
+  const auto prepared = [&](const std::string& input, const NamedNumbers& start) {
+    FitRequest request = request_for(input, log);
+    request.start = start;
+    request.max_iterations = 0;
+    return prepare_fit(std::move(request));
+  };
+  const auto started_as = [&](const std::string& input, const NamedNumbers& start) { return run_fit(prepared(input, start)); };
+  const NamedNumbers from_file{.file = (folder / "late.json").string(), .values = {}};
+  const FitOutcome as_it_is = started_as(estimated, from_file);
+  EXPECT_NEAR(as_it_is.file.report.negative_log_likelihood, fit.file.report.negative_log_likelihood, 1e-6);
+  EXPECT_EQ(as_it_is.file.model.actuators[0].delay.value, fit.file.model.actuators[0].delay.value);
+  EXPECT_EQ(started_as(estimated, {.file = "", .values = {{"u.lag", 0.03}}}).file.model.actuators[0].lag.value, 0.03);
+  EXPECT_THAT(input_error_of([&] {
+                started_as(estimated, {.file = "", .values = {{"u.lag", 3}}});
+              }),
+              HasSubstr("u.lag = 3 is outside its bounds [0, 0.1]"));
+  // one that holds them says what it does not take
+  const FitJob held = prepared(R"({ name = "u", delay = 0.01 })", from_file);
+  EXPECT_THAT(held.notes,
+              Contains(testing::AllOf(HasSubstr("u.delay = "), HasSubstr(" is not taken: this fit does not estimate it "
+                                                                         "and has 0.01 of the model"))));
+}
+
 TEST(ActuatorFit, CountsWhatAnErrorOfALagMakesOfAMass) {
   const CsvTable log = late_cart_log(0, 0.04, 100, 6, 8);
   const auto fit_with = [&](const std::string& lag) {

@@ -1,13 +1,17 @@
 #include "gp2/jobs/command_record.hpp"
 
 #include <algorithm>
+#include <cmath>
+#include <memory>
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/generate_job.hpp"
+#include "gp2/jobs/report_job.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/simulate.hpp"
 #include "input_error.hpp"
@@ -146,8 +150,39 @@ TEST(CommandRecord, WhatDependsOnWhatWasBeforeIsPredictedAndNotCompared) {
   const std::string note =
       "log: 22 of 201 rows as if the inputs had been at rest before: what acts there depends on commands before the log";
   EXPECT_THAT(notes_from(0, 1), Contains(note));
+  EXPECT_THAT(notes_from(1e-3, 1), Contains(note));  // as smoothing leaves a 0
   EXPECT_THAT(notes_from(0.7, 30), Contains(note));
   EXPECT_THAT(notes_from(0.7, 5), Contains(HasSubstr("warning: log: 22 of 201 rows are predicted")));
+}
+
+// A log without noise has the truth's accelerations, by whatever delays a fit has learned from it.
+TEST(CommandRecord, ATruthActsByItsOwnDelays) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1, 0);
+  FitRequest learn;
+  learn.model = late_cart(R"({ name = "u", delay = 0.01 })");
+  learn.logs = {{log}};
+  learn.problem.mean = Prior::Mean::force;
+  learn.hyperparameters = HyperparameterChoice::optimise;
+  learn.max_iterations = 0;
+  const FitOutcome fit = run_fit(prepare_fit(std::move(learn)));
+  ReportRequest request;
+  request.data = log;
+  request.truth = std::make_shared<const Model>(late_cart(R"({ name = "u", delay = 0.02, lag = 0.04 })"));
+  std::vector<std::string> notes;
+  const Report report = collect_report(fit.file, fit.posterior, request, notes);
+  const ReportData& test = report.data.back();
+  int n = 0;
+  for (Eigen::Index i = 0; i < test.truth.cols(); ++i) {
+    if (std::isnan(test.measured(0, i))) continue;
+    EXPECT_NEAR(test.truth(0, i), test.measured(0, i), 1e-8) << i;
+    ++n;
+  }
+  EXPECT_GT(n, 150);
+  EXPECT_EQ(report.data.front().truth.size(), 0);
+  EXPECT_THAT(report.notes, Contains(HasSubstr("the true acceleration at the data of training is not shown")));
+  request.data.reset();
+  EXPECT_THAT(input_error_of([&] { collect_report(fit.file, fit.posterior, request, notes); }),
+              HasSubstr("has other delays or lags than the fit, which keeps no commands"));
 }
 
 // A fit has found its delays and lags: what is predicted by it reaches back as far as these do, not as far as they might.

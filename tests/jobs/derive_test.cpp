@@ -319,12 +319,21 @@ TEST(Derive, SaysThatMeasuredCoordinatesContradictAConstraint) {
   const auto fault = [](const CsvTable& log) { return input_error_of([&] { derive(pendulum(), log); }); };
   const std::vector<int> some = {0, 2, 5};
   EXPECT_THAT(fault(log_of_many(some, noise)), HasSubstr("which noise contradicts, so that q2, q4, q5 cannot be solved for"));
+  // a warning that may tell why is not lost
+  std::vector<std::string> cells;
+  const CsvTable whole = log_of_many(some, noise);
+  for (int i = 0; i < whole.n_rows(); ++i) {
+    for (int k = 0; k < 4; ++k) cells.push_back(whole.cell(k == 1 && i > 100 && i < 140 ? 100 : i, k));
+  }
+  EXPECT_THAT(fault(CsvTable::from_cells("log", whole.header(), cells)),
+              testing::AllOf(HasSubstr("cannot be solved for"), HasSubstr("\nwarning: log: q1 jumps by "),
+                             HasSubstr("after 40 equal samples: was its sensor stuck?")));
   // one constraint: how far each alone would have to move
   EXPECT_THAT(fault(log_of_many(some, noise, 100 * noise)),
               testing::AllOf(HasSubstr("log: q2, q4, q5 cannot be solved for: measured coordinates contradict the constraints "
                                        "among them, by "),
                              HasSubstr("; to meet them one would have to move, q1 by 0.01 or q3 by "),
-                             HasSubstr(": are their units and zeros those of the model?")));
+                             HasSubstr(": are their units, signs and zeros, and the lengths, those of the model?")));
 }
 
 TEST(Derive, TellsAClockThatIsCoarserThanTheSamplesFromSecondMeasurements) {
@@ -350,6 +359,34 @@ TEST(Derive, TellsAClockThatIsCoarserThanTheSamplesFromSecondMeasurements) {
   EXPECT_THAT(twice.notes, Each(Not(coarse)));
   EXPECT_EQ(twice.series[0].outliers, 0);
   EXPECT_THAT(derive(cart(), cart_log()).notes, Each(Not(coarse)));
+}
+
+TEST(Derive, TellsAClockThatIsNotThatOfTheSamples) {
+  constexpr double step = 0.02, noise = 2e-4;
+  const auto notes_of = [&](double jitter, bool is_true, bool drops, double noise_stddev) {
+    RandomStream random(3);
+    std::vector<std::string> cells;
+    for (int k = 0; k < 300; ++k) {
+      const double even = step * k, stamp = even + std::clamp(jitter * random.normal(), -0.4 * step, 0.4 * step);
+      const double t = is_true ? stamp : even, q = std::sin(3 * t) + 0.5 * std::sin(7.3 * t) + noise_stddev * random.normal();
+      if (drops && k % 50 > 47) continue;
+      cells.push_back(shortest(stamp));
+      cells.push_back(shortest(q));
+    }
+    return derive(cart(), CsvTable::from_cells("log.csv", {"t", "q1"}, cells)).notes;
+  };
+  const auto told =
+      Contains(HasSubstr("warning: log.csv: the times are not those of the samples: at times 0.02 s apart, from which"));
+  const auto silent = Each(Not(HasSubstr("not those of the samples")));
+  EXPECT_THAT(notes_of(0.004, false, false, noise), told);
+  EXPECT_THAT(notes_of(0.002, false, true, noise), told) << "samples dropped by whole steps";
+  for (const bool drops : {false, true}) {
+    for (const double jitter : {0.0, 1e-6, 0.0005, 0.002, 0.005}) {
+      for (const double noise_stddev : {0.0, 1e-6, noise, 0.01})
+        EXPECT_THAT(notes_of(jitter, true, drops, noise_stddev), silent) << jitter << " " << drops << " " << noise_stddev;
+    }
+  }
+  EXPECT_THAT(notes_of(0.002, false, false, 0.1), silent) << "noise hides it";
 }
 
 TEST(Derive, GapsMissingCellsAndRepeatedRowsAreCountedAndBridged) {

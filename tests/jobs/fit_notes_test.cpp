@@ -384,6 +384,10 @@ TEST(FitNotes, TellWhereStretchesArePredictedWorseThanRows) {
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8), told) << "too sure of itself";
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8, 50), testing::IsEmpty()) << "too few rows for a coverage";
   EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.95), testing::IsEmpty());
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0313, 0.0842, 0.907, 150)), told) << "a mass that a general latent takes up";
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0313, 0.0842, 0.951, 150)), testing::IsEmpty()) << "the bands hold";
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0313, 0.0842, 0.907, 60)), testing::IsEmpty()) << "few rows";
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0304, 0.0486, 0.927, 150)), testing::IsEmpty()) << "sound";
   EXPECT_THAT(note_of(scores_of(0.0068, 0.0058, 0.043, 0.995, 267)), testing::IsEmpty()) << "sound: the bands hold";
   EXPECT_THAT(note_of_stretches(0.08, 0.085, 0.95), testing::IsEmpty()) << "rows are no better";
 }
@@ -393,6 +397,11 @@ TEST(FitNotes, WarnWhereLeftOutRowsDenyTheModel) {
   const auto warned = ElementsAre(StartsWith("warning: stretches of the log that were left out are predicted worse"));
   EXPECT_THAT(note_of(scores_of(0.0147, 0.034, 0.196, 0.923, 151)), warned) << "a constraint is missing";
   EXPECT_THAT(note_of(scores_of(0.0147, 0.034, 0.196, 0.923, 60)), ElementsAre(StartsWith("stretches"))) << "few rows";
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0542, 0.38, 0.84, 150)), warned) << "a constraint is missing, a general latent";
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0542, 0.38, 0.84, 60)), ElementsAre(StartsWith("stretches"))) << "few rows";
+  EXPECT_THAT(note_of(scores_of(0.03, 0.0542, 0.708, 0.84, 150)),
+              ElementsAre(StartsWith("warning: the fit predicts unseen stretches of the log badly")))
+      << "the same, more of it";
   EXPECT_THAT(note_of(scores_of(0.0132, 0.018, 0.276, 0.93, 121)), ElementsAre(StartsWith("stretches")))
       << "sound: one motion, whose ends are unlike its middle";
   EXPECT_THAT(note_of(scores_of(0.0147, 0.0221, 0.0509, 0.909, 151)), ElementsAre(StartsWith("stretches")))
@@ -423,6 +432,7 @@ TEST(FitNotes, NameCausesThatTheModelCanHave) {
   EXPECT_THAT(causes("", "force"),
               AllOf(Not(HasSubstr("input")), Not(HasSubstr("potential")), HasSubstr("a constraint that is")));
   EXPECT_THAT(causes("inputs = ['u']\n", "force"), HasSubstr("an input that is clipped"));
+  EXPECT_THAT(causes("", "force"), HasSubstr("a clock that is not that of the samples"));
   EXPECT_THAT(causes("", "potential"), HasSubstr("a force that dissipates, which a potential does not"));
 }
 

@@ -1,6 +1,7 @@
 #include "jobs/rate_check.hpp"
 
 #include <cmath>
+#include <functional>
 #include <numbers>
 #include <random>
 
@@ -10,6 +11,7 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "jobs/reading_notes.hpp"
 
 namespace gp2 {
 
@@ -238,6 +240,111 @@ TEST(WrongRates, AreNamedWhereARowIsThereTwiceOrAnEpisodeBeginsAnew) {
     const auto notes = wrong_rates(*model.system, states.leftCols(n), Eigen::MatrixXd::Constant(1, n, std::nan("")), true);
     EXPECT_THAT(notes, testing::ElementsAre(HasSubstr("a wrong sign"))) << is_episode;
   }
+}
+
+// A driven mass of which 15 of 150 rows are edited.
+std::vector<std::string> stuck_in(const std::function<void(Eigen::Ref<Eigen::MatrixXd> states, Eigen::RowVectorXd& ddx)>& edit) {
+  static const Model model =
+      Model::parse("coordinates = [\"x\"]\ninputs = [\"u\"]\n[mechanics]\nmass = [[\"1\"]]\nforce = [\"u\"]\n", "mass");
+  Eigen::MatrixXd states(4, 150);  // x, dx, t, u
+  Eigen::RowVectorXd ddx(states.cols());
+  for (Index i = 0; i < states.cols(); ++i) {
+    const double t = 0.05 * static_cast<double>(i);
+    states.col(i) << std::sin(2 * t) + 0.2 * std::sin(5 * t), 2 * std::cos(2 * t) + std::cos(5 * t), t,
+        -4 * std::sin(2 * t) - 5 * std::sin(5 * t) + 0.1;
+    ddx[i] = states(3, i) - 0.1 + 0.05 * std::sin(100.0 * static_cast<double>(i));
+  }
+  edit(states, ddx);
+  return stuck_channels(*model.system, states, ddx);
+}
+
+TEST(StuckChannels, AreNamedWithTheirRows) {
+  constexpr Index first = 60, n = 15;
+  const auto hold = [](auto row) { row.segment(first, n).setConstant(row[first]); };
+  const auto named = [](const char* name) {
+    return testing::ElementsAre(HasSubstr(std::string(name) + " is the same in data rows 61 to 75, while the system moves"));
+  };
+  EXPECT_THAT(stuck_in([](auto, auto&) {}), IsEmpty());
+  EXPECT_THAT(stuck_in([&](auto states, auto&) { hold(states.row(0)); }), named("x"));
+  EXPECT_THAT(stuck_in([&](auto states, auto&) { hold(states.row(1)); }), named("dx"));
+  EXPECT_THAT(stuck_in([&](auto, auto& ddx) { hold(ddx.segment(0, ddx.size())); }), named("ddx"));
+  EXPECT_THAT(stuck_in([&](auto states, auto&) { hold(states.row(3)); }), named("u"));
+}
+
+TEST(StuckChannels, AreNotThoseThatRestOrAreHeld) {
+  const auto rounded = [](auto row, double step) { row = (row.array() / step).round() * step; };
+  EXPECT_THAT(stuck_in([&](auto states, auto& ddx) {  // a stop, whose accelerometer has noise
+                states.row(0).segment(60, 30).setConstant(0.3), states.row(1).segment(60, 30).setZero();
+                ddx.segment(60, 30) *= 0.01;
+              }),
+              IsEmpty());
+  EXPECT_THAT(stuck_in([&](auto states, auto& ddx) {  // a constant acceleration, that of a fall say
+                for (Index i = 0; i < 40; ++i) {
+                  const double t = 0.05 * static_cast<double>(i);
+                  states(0, i) = 1 - 4.905 * t * t, states(1, i) = -9.81 * t, ddx[i] = -9.81;
+                }
+              }),
+              IsEmpty());
+  EXPECT_THAT(stuck_in([&](auto states, auto& ddx) {
+                for (Index row : {0, 1, 3}) rounded(states.row(row), 0.4);
+                rounded(ddx.segment(0, ddx.size()), 2);
+              }),
+              IsEmpty());
+  EXPECT_THAT(stuck_in([](auto states, auto&) {  // steps of ten rows
+                for (Index i = 0; i < 150; ++i) states(3, i) = states(3, i / 10 * 10);
+              }),
+              IsEmpty());
+  EXPECT_THAT(stuck_in([](auto states, auto&) { states.row(3).segment(40, 30).setZero(); }), IsEmpty()) << "switched off";
+  EXPECT_THAT(stuck_in([](auto states, auto&) { states.row(3) = states.row(3).cwiseMin(5).eval(); }), IsEmpty()) << "clipped";
+}
+
+TEST(StuckChannels, AreToldByAFit) {
+  const Model model = Model::parse(
+      "coordinates = ['x']\ninputs = ['u']\n[mechanics]\nmass = [['1']]\nforce = ['u']\n[noise]\nddq = 0.05\n[[latent]]\n"
+      "features = ['dx']\ndirections = 'force'\n",
+      "mass");
+  std::string text = "t,x,dx,u,ddx\n";
+  for (int i = 0; i < 150; ++i) {
+    const double t = 0.05 * i, logged = i > 60 && i < 75 ? 3.0 : t, x = std::sin(2 * t);
+    text += fmt::format("{},{},{},{},{}\n", t, x, 2 * std::cos(2 * t), -4 * std::sin(2 * logged), -4 * x);
+  }
+  EXPECT_THAT(make_fit_problem(model, CsvTable::parse(text, "log.csv"), {}).notes,
+              testing::Contains(HasSubstr("warning: log.csv: u is the same in data rows 61 to 75, while the system moves")));
+}
+
+// A rope that was slack is pulled tight in three impacts: the acceleration shows nothing of these, and the swing only begins after them.
+TEST(WrongRates, AreNotThoseOfAMotionWithImpacts) {
+  const auto notes_under = [](const std::string& rope, const std::string& inputs) {
+    const Model model = Model::parse(fmt::format(R"(
+coordinates = ["x"]
+inputs = [{}]
+[mechanics]
+mass = [["1"]]
+force = ["0"]
+[constraints]
+position = [{}]
+)",
+                                                 inputs, rope),
+                                     "rope");
+    const Index n = 300;
+    Eigen::MatrixXd states = Eigen::MatrixXd::Zero(model.system->layout().size(), n), accelerations(1, n);
+    double x = 0, dx = 0.46;
+    for (Index i = 0; i < n; ++i) {
+      const double dt = 0.01, since = dt * static_cast<double>(i - 44);
+      const double before = i == 0 ? 0.2 : accelerations(0, i - 1), now = i < 44 ? 0.2 : -4.3 * std::cos(4.3 * since);
+      const double impact = i == 35 ? -1.25 : i == 42 ? -0.21 : i == 44 ? -0.04 : 0;
+      if (i > 0) {
+        const double change = impact + dt * (i == 44 ? before : (before + now) / 2);
+        x += dt * (dx + change / 2);
+        dx += change;
+      }
+      states(0, i) = x, states(1, i) = dx, states(2, i) = dt * static_cast<double>(i);
+      accelerations(0, i) = now;
+    }
+    return wrong_rates(*model.system, states, accelerations, true);
+  };
+  EXPECT_THAT(notes_under(R"({ expr = "5 - x", contact = "taut", restitution = 0.2 })", "\"taut\""), IsEmpty());
+  EXPECT_THAT(notes_under("", ""), testing::ElementsAre(HasSubstr("the column lags")));
 }
 
 TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {

@@ -280,6 +280,22 @@ directions = "force"
   EXPECT_NO_THROW(learn_and_smooth(asked, slider_log("place"), {.most_passes = 0}));
 }
 
+// which may be its cause
+TEST(LearnAndSmooth, TellsWarningsOfTheLogBesideAnErrorOfTheFit) {
+  const CsvTable sound = slider_log("x");
+  std::vector<std::string> cells;
+  for (int i = 0; i < sound.n_rows(); ++i) {
+    cells.push_back(sound.cell(i, 0));
+    cells.push_back(sound.cell(i > 200 && i < 260 ? 200 : i, 1));
+  }
+  FitRequest asked = request_of_slider();
+  asked.problem.observe = {"ddy"};
+  EXPECT_THAT(input_error_of([&] {
+                learn_and_smooth(asked, CsvTable::from_cells("log", {"t", "x"}, cells), {.most_passes = 1});
+              }),
+              testing::AllOf(HasSubstr("ddy"), HasSubstr("\nwarning: log: x "), HasSubstr("was its sensor stuck?")));
+}
+
 // of which no acceleration says anything
 TEST(LearnAndSmooth, TakesAMotionThatConstraintsPrescribe) {
   const FitRequest asked = request_of_slider("[constraints]\nposition = ['x - 0.5*sin(2*t)']\n");

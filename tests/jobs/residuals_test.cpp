@@ -451,6 +451,30 @@ TEST(Residuals, TellOfAnInputThatActsOtherwiseThanLogged) {
   }
 }
 
+TEST(Residuals, TellOfAFactorThatIsNearOne) {
+  const Driven driven;
+  for (const std::uint64_t seed : {31U, 32U}) {
+    Data data = driven.data(seed);
+    data.states.row(driven.row_of(0)) *= 1.3;
+    EXPECT_THAT(notes_of(notes_of_fit(data), "the input "),
+                testing::ElementsAre(testing::AllOf(HasSubstr("input u: "), testing::ContainsRegex("acts 0.7[5-9]"))));
+  }
+}
+
+TEST(Residuals, BlameNoInputForAWrongSignOfGravity) {
+  const Driven driven;
+  Driven turned;
+  turned.model = Model::parse(test::changed(driven.model.text, {{"-9.81", "9.81"}}), "driven.toml");
+  for (const std::uint64_t seed : {31U, 32U}) {
+    Data data = driven.data(seed);
+    data.model = &turned.model;
+    const std::vector<std::string> notes = notes_of_fit(data);
+    EXPECT_THAT(notes, Not(Contains(HasSubstr("the input "))));
+    EXPECT_THAT(notes_of(notes, "known force without inputs"),
+                testing::ElementsAre(testing::ContainsRegex("acts -(1|0.9[5-9]?|1.0[0-9]?) ± [0-9.]+ times as modelled")));
+  }
+}
+
 TEST(Residuals, TellOfAnInputThatActsByItsSquareOrItsLogarithm) {
   Driven driven("u*abs(u)");
   Data data = driven.data(36);
@@ -586,6 +610,26 @@ TEST(Residuals, TellOfAnInputThatActsLate) {
               testing::ElementsAre(AnyOf(HasSubstr("it acts about 6 rows later than logged"),
                                          HasSubstr("it acts about 9 rows later than logged"))))
       << "8 rows of the log";
+}
+
+// Beside what holds a weight, what moves is a small share of an input.
+TEST(Residuals, TellOfADelayOfAnInputThatHoldsAWeight) {
+  const auto notes_of_delay = [](double delay) {
+    const CsvTable log = test::late_cart_log(delay, 0, 100, 1, 47);
+    std::vector<CsvTable::Column> columns;
+    for (const std::string& name : log.header()) {
+      const double held = name == "u" ? 30 : 0;
+      std::vector<double> values;
+      for (int row = 0; row < log.n_rows(); ++row) values.push_back(held + log.number(row, log.find(name)));
+      columns.push_back({name, std::move(values)});
+    }
+    const Model lift = Model::parse(test::changed(test::late_cart("'u'").text, {{"[\"u\"]", "[\"u - 30\"]"}}), "lift.toml");
+    FitRequest request = fit_request(lift, {CsvTable::from_columns("lift", std::move(columns))});
+    request.thin = false;
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input ");
+  };
+  EXPECT_THAT(notes_of_delay(0), testing::IsEmpty());
+  EXPECT_THAT(notes_of_delay(0.01), testing::ElementsAre(HasSubstr("it acts 1 row later than logged")));
 }
 
 TEST(Residuals, TellOfInputsThatAreSwapped) {

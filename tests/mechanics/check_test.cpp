@@ -2,11 +2,13 @@
 
 #include <cmath>
 #include <random>
+#include <stdexcept>
 
 #include <gmock/gmock.h>
 
 #include "gp2/mechanics/callable_system.hpp"
 #include "gp2/model.hpp"
+#include "input_error.hpp"
 
 namespace gp2 {
 namespace {
@@ -152,6 +154,96 @@ TEST(Check, AWrongBIsFound) {
   EXPECT_THAT(finding.text, HasSubstr("largest for 'd/dt of wire'"));
 }
 
+// A bead on a wire that is moved along it by u, against friction that changes with t.
+CallableSystem::Definition bead_in_code() {
+  CallableSystem::Definition code;
+  code.declaration = {"a bead in code", {{"x"}, {"z"}}, {"u"}, {}};
+  code.constraints = {{"wire", ConstraintLevel::position}};
+  code.evaluate = [](const CallableSystem::States& states, const CallableSystem::Parameters&) {
+    const Eigen::Index n = states.cols();
+    SystemValues values{MatrixXd::Zero(4, n), MatrixXd::Zero(2, n), MatrixXd::Zero(1, n), MatrixXd::Zero(2, n)};
+    for (Eigen::Index i = 0; i < n; ++i) {
+      const double x = states(0, i), dx = states(2, i), t = states(4, i), u = states(5, i);
+      values.mass.col(i) << 1, 0, 0, 1;
+      values.constraint_matrix.col(i) << -x, 1;
+      values.constraint_vector(0, i) = dx * dx;
+      values.force.col(i) << u - 0.1 * t * dx, -9.81;
+    }
+    return values;
+  };
+  code.residuals = [](const CallableSystem::States& states, const CallableSystem::Parameters&) -> MatrixXd {
+    MatrixXd values(2, states.cols());
+    values.row(0) = states.row(1).array() - 0.5 * states.row(0).array().square();
+    values.row(1) = states.row(3).array() - states.row(0).array() * states.row(2).array();
+    return values;
+  };
+  code.mechanics_reads = {{"x", "dx"}};
+  code.force_reads = {{"dx", "t", "u"}};
+  code.residuals_read = {{"x", "z", "dx", "dz"}};
+  return code;
+}
+
+MatrixXd bead_states_with_input() {
+  MatrixXd states(6, 3);
+  states << bead_states(), Eigen::RowVector3d(0, 1, 0);
+  return states;
+}
+
+std::vector<std::string> undeclared_reads(const CallableSystem::Definition& definition, const MatrixXd& states) {
+  std::vector<std::string> texts;
+  for (const Finding& finding : check_system(CallableSystem(definition), states, Eigen::VectorXd())) {
+    if (finding.text.starts_with("declared reads:")) texts.push_back(finding.text);
+    EXPECT_EQ(finding.level, finding.text.starts_with("declared reads:") ? Finding::Level::warning : Finding::Level::good);
+  }
+  return texts;
+}
+
+TEST(Check, WhatCodeReadsWithoutDeclaringItIsFound) {
+  using testing::ElementsAre;
+  MatrixXd states = bead_states_with_input();
+  CallableSystem::Definition code = bead_in_code();
+  EXPECT_THAT(undeclared_reads(code, states), testing::IsEmpty());
+  code.mechanics_reads = {{"x"}};
+  EXPECT_THAT(undeclared_reads(code, states),
+              ElementsAre("declared reads: M, A or b depend on dx, which mechanics_reads (in Python reads) lacks: derivatives in "
+                          "the state are wrong, and a log need not have such columns; add the names"));
+  code.force_reads = {{"dx"}};
+  code.residuals_read = {{"z", "dx", "dz"}};
+  EXPECT_THAT(undeclared_reads(code, states), ElementsAre(HasSubstr("M, A or b depend on dx, which mechanics_reads"),
+                                                          HasSubstr("F depends on t, u, which force_reads"),
+                                                          HasSubstr("the residuals depend on x, which residuals_read")));
+  // at rest, and where nothing that is declared as not read is measured
+  states.middleRows(2, 2).setZero();
+  EXPECT_THAT(undeclared_reads(code, states.leftCols(1)), testing::SizeIs(3));
+  code = bead_in_code();
+  code.residuals = nullptr;
+  states.row(1).setConstant(std::nan(""));
+  states.row(3).setConstant(std::nan(""));
+  EXPECT_THAT(undeclared_reads(code, states), testing::IsEmpty());
+  // to refuse a value is to read it
+  code.evaluate = [evaluate = code.evaluate](const auto& x, const auto& parameters) {
+    if (x.row(3).maxCoeff() > 0) throw std::range_error("dz");
+    return evaluate(x, parameters);
+  };
+  EXPECT_THAT(undeclared_reads(code, states), ElementsAre(HasSubstr("M, A or b depend on dz"), HasSubstr("F depends on dz")));
+}
+
+TEST(Check, ToCodeMissingCoriolisForcesAreToldInItsOwnWords) {
+  CallableSystem::Definition code = bead_in_code();
+  code.evaluate = [evaluate = code.evaluate](const auto& states, const auto& parameters) {
+    SystemValues values = evaluate(states, parameters);
+    values.mass.row(0) = 1 + states.row(0).array().square();
+    return values;
+  };
+  std::string text;
+  for (const Finding& one : check_system(CallableSystem(code), bead_states_with_input(), Eigen::VectorXd())) {
+    if (one.level == Finding::Level::warning) text += one.text;
+  }
+  EXPECT_EQ(text,
+            "mass matrix: it changes with the motion, but no part of the force is quadratic in the velocities: the Coriolis and "
+            "centrifugal forces are missing; add them to F");
+}
+
 TEST(Check, AFastMechanismIsFollowedByShorterSteps) {
   const Model model = Model::parse(R"(
 coordinates = ["a", "b", "c"]
@@ -265,6 +357,49 @@ struct NoisyBead {
     return {Finding::Level::error, "not looked at"};
   }
 };
+
+TEST(Check, ANoiseThatIsNotGivenIsNotKnown) {
+  const NoisyBead bead;
+  const MatrixXd unknown = MatrixXd::Constant(2, NoisyBead::n, std::nan(""));
+  const Eigen::VectorXd none;
+  for (const std::vector<int>& stated : {std::vector<int>{}, {1}}) {
+    for (const bool estimates : {false, true}) {
+      const auto of = [&](const MatrixXd& stddev) {
+        return all_of(check_data(*bead.model.system, bead.states, none, bead.ddq, stddev, stated, estimates));
+      };
+      EXPECT_EQ(of(MatrixXd()), of(unknown));
+    }
+  }
+  const auto residuals = constraint_residuals(*bead.model.system, bead.states, none, bead.ddq, MatrixXd());
+  ASSERT_THAT(residuals, testing::SizeIs(1));
+  EXPECT_EQ(residuals[0].n, NoisyBead::n);
+  EXPECT_TRUE(std::isnan(residuals[0].expected));
+}
+
+TEST(Check, WrongSizesAreRefused) {
+  const NoisyBead bead;
+  const System& system = *bead.model.system;
+  const MatrixXd &x = bead.states, &ddq = bead.ddq, &noise = bead.noise;
+  const Eigen::VectorXd none;
+  const auto refused = [](const auto& call) { return test::input_error_of([&] { static_cast<void>(call()); }); };
+  EXPECT_EQ(refused([&] { return check_system(system, x.leftCols(0), none); }), "check_system: there are no states");
+  EXPECT_EQ(refused([&] { return check_data(system, x, none, ddq, noise.leftCols(2)); }),
+            "check_data: stddev must be 2 × 100, got 2 × 2");
+  EXPECT_EQ(refused([&] {
+              return check_data(system, x, none, ddq, noise, {1, 2});
+            }),
+            "check_data: stated: there are the rows 0 … 1, got 2");
+  EXPECT_THAT(refused([&] { return check_data(system, x, none, ddq, noise, {-1}); }), HasSubstr("got -1"));
+  EXPECT_EQ(refused([&] { return constraint_residuals(system, x, none, ddq.leftCols(2), noise); }),
+            "constraint_residuals: accelerations must be 2 × 100, got 2 × 2");
+  EXPECT_EQ(refused([&] { return constraint_residuals(system, x, none, ddq, noise.topRows(1)); }),
+            "constraint_residuals: stddev must be 2 × 100, got 1 × 100");
+  EXPECT_EQ(refused([&] { return dependent_columns(system, x, none, ddq.topRows(1)); }),
+            "dependent_columns: accelerations must be 2 × 100, got 1 × 100");
+  EXPECT_EQ(refused([&] { return dependent_columns(system, x, none, ddq, noise.leftCols(99)); }),
+            "dependent_columns: stddev must be 2 × 100, got 2 × 99");
+  EXPECT_TRUE(std::isnan(constraint_violations(system, x.leftCols(0), none).front().value));
+}
 
 TEST(Check, OutliersAreNamedAsSuch) {
   NoisyBead bead;

@@ -1,6 +1,10 @@
+#include <cmath>
+#include <stdexcept>
+
 #include <fmt/format.h>
 #include <gtest/gtest.h>
 
+#include "gp2/mechanics/callable_system.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
@@ -87,6 +91,88 @@ TEST(ConstraintRowsTest, RedundantOnesStaySoAtMeasuredStates) {
                 1000 * error * (1 + test::largest(there.projections[i].Lb())));
     }
   }
+}
+
+// The functions of a text as code.
+CallableSystem::Definition in_code(const Model& model) {
+  const std::shared_ptr<const System> text = model.system;
+  CallableSystem::Definition code;
+  code.declaration = {text->name(), text->coordinates(), text->inputs(), text->parameters()};
+  for (const std::string& label : text->constraint_labels()) code.constraints.push_back({label, ConstraintLevel::position});
+  code.evaluate = [text](const auto& states, const auto& parameters) { return text->evaluate(states, parameters); };
+  code.residuals = [text](const auto& states, const auto& parameters) { return text->residuals(states, parameters); };
+  return code;
+}
+
+TEST(ConstraintRowsTest, RedundantOnesOfCodeAreThoseOfText) {
+  const Model& model = test::model("models/slider_crank.toml");
+  const VectorXd parameters = model.system->parameter_values();
+  const CallableSystem code(in_code(model));
+  EXPECT_EQ(code.largest_rank(), 2);
+  RandomStream random(constraint_rows_seed);
+  MatrixXd measured = test::draw(model, 20, constraint_rows_seed).states;
+  for (double& entry : measured.topRows(6).reshaped()) entry += 1e-6 * (2 * random.uniform() - 1);
+  const MechanicsBatch expected = require_mechanics(*model.system, measured, parameters);
+  const MechanicsBatch got = require_mechanics(code, measured, parameters);
+  for (std::size_t i = 0; i < expected.projections.size(); ++i) {
+    EXPECT_EQ(got.projections[i].T(), expected.projections[i].T());
+    EXPECT_EQ(got.projections[i].Lb(), expected.projections[i].Lb());
+  }
+}
+
+TEST(ConstraintRowsTest, OfCodeTheLargestRankIsKnownWhereItsResidualsGiveStates) {
+  const Model& model = test::model("models/slider_crank.toml");
+  CallableSystem::Definition changed = in_code(model);
+  changed.residuals = nullptr;
+  EXPECT_EQ(CallableSystem(changed).largest_rank(), 3);
+
+  changed = in_code(model);
+  changed.constraints[2].level = ConstraintLevel::velocity;
+  EXPECT_EQ(CallableSystem(changed).largest_rank(), 3);
+
+  // functions that refuse some states, or all
+  for (const double largest : {1.0, -10.0}) {  // of u1
+    changed = in_code(model);
+    changed.evaluate = [&, largest](const auto& states, const auto& parameters) {
+      if (states.row(7).maxCoeff() > largest) throw std::range_error("out of the table");
+      return model.system->evaluate(states, parameters);
+    };
+    changed.residuals = [&, largest](const auto& states, const auto& parameters) -> MatrixXd {
+      if (states.row(7).minCoeff() < -largest) return MatrixXd::Constant(6, states.cols(), std::nan(""));
+      return model.system->residuals(states, parameters);
+    };
+    EXPECT_EQ(CallableSystem(changed).largest_rank(), largest > 0 ? 2 : 3);
+  }
+
+  // residuals that A and b do not fit: in part, of the lengths in the file
+  changed = in_code(model);
+  changed.evaluate = [&](const auto& states, const auto&) {
+    return model.system->evaluate(states, model.system->parameter_values());
+  };
+  EXPECT_EQ(CallableSystem(changed).largest_rank(), 2);
+  changed.residuals = [&](const auto& states, const auto& parameters) -> MatrixXd {
+    return model.system->residuals(states, parameters * 1.1);
+  };
+  EXPECT_EQ(CallableSystem(changed).largest_rank(), 3);
+
+  // looked for once, and within the bounds of parameters
+  int n_calls = 0;
+  double smallest = 1;
+  changed = in_code(model);
+  changed.declaration.parameters[0].bounds = {0.004, 0.0041};
+  changed.evaluate = [&](const auto& states, const auto& parameters) {
+    ++n_calls;
+    smallest = std::min(smallest, std::min(parameters[0] - 0.004, 0.0041 - parameters[0]));
+    return model.system->evaluate(states, parameters);
+  };
+  const CallableSystem code(changed);
+  EXPECT_EQ(n_calls, 0);
+  EXPECT_EQ(code.largest_rank(), 2);
+  EXPECT_GT(n_calls, 0);
+  n_calls = 0;
+  EXPECT_EQ(code.largest_rank(), 2);
+  EXPECT_EQ(n_calls, 0);
+  EXPECT_GE(smallest, 0);
 }
 
 TEST(ConstraintRowsTest, TheirLargestRankIsKnownWherePositionsDecideIt) {

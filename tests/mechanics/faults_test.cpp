@@ -114,5 +114,25 @@ TEST(MechanicsFaults, TheCheckedEvaluationReportsTheSameFaultAsAValue) {
   EXPECT_EQ(batch.fault->state, 1);
 }
 
+TEST(MechanicsFaults, MatricesThatDoNotFitEachOtherAreRefused) {
+  const MatrixXd M = MatrixXd::Identity(3, 3), A = MatrixXd::Ones(1, 3);
+  const VectorXd b = VectorXd::Ones(1), two = VectorXd::Ones(2), four = VectorXd::Ones(4);
+  const UdwadiaKalaba projection(M, A, b);
+  const auto refused = [](const auto& call) { return test::input_error_of([&] { static_cast<void>(call()); }); };
+  EXPECT_EQ(refused([&] { return UdwadiaKalaba(M.leftCols(2), A, b); }), "UdwadiaKalaba: M must be 3 × 3, got 3 × 2");
+  EXPECT_EQ(refused([&] { return UdwadiaKalaba(M, A.leftCols(2), b); }), "UdwadiaKalaba: A must be 1 × 3, got 1 × 2");
+  EXPECT_EQ(refused([&] { return UdwadiaKalaba(M, A, two); }), "UdwadiaKalaba: b must be 1 × 1, got 2 × 1");
+  EXPECT_EQ(refused([&] { return projection.constrain(two); }), "UdwadiaKalaba::constrain: a_bar must be 3 × 1, got 2 × 1");
+  EXPECT_EQ(refused([&] { return projection.solve_mass(four); }), "UdwadiaKalaba::solve_mass: v must be 3 × 1, got 4 × 1");
+  EXPECT_EQ(refused([&] { return projection.is_contradictory(four); }),
+            "UdwadiaKalaba::is_contradictory: F must be 3 × 1, got 4 × 1");
+  EXPECT_EQ(refused([&] { return projection.differentiate(M, A, two); }),
+            "UdwadiaKalaba::differentiate: db must be 1 × 1, got 2 × 1");
+  EXPECT_EQ(refused([&] { return projection.differentiate_mass(M, A.leftCols(2)); }),
+            "UdwadiaKalaba::differentiate_mass: dA must be 1 × 3, got 1 × 2");
+  MatrixXd L(2, 1);
+  EXPECT_EQ(test::input_error_of([&] { projection.write_L(L); }), "UdwadiaKalaba::write_L: L must be 3 × 1, got 2 × 1");
+}
+
 }  // namespace
 }  // namespace gp2

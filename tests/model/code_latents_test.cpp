@@ -247,6 +247,65 @@ TEST(CodeLatents, WithoutAFileDeclareEverythingThatTheyHave) {
   EXPECT_EQ(model.system, text_bead().system);
 }
 
+TEST(CodeLatents, WithoutAFileAreRefusedWhereItsTextWouldSayLess) {
+  const auto refused = [](const std::function<void(LatentSpec&)>& change) {
+    LatentSpec spec;
+    spec.name = "friction";
+    spec.kernel = "se";
+    spec.features = {"x", "dx"};
+    change(spec);
+    EXPECT_NO_THROW(make_prior(text_bead().system, {spec}));
+    return input_error_of([&] { Model::from_code(text_bead().system, {spec}); });
+  };
+  EXPECT_EQ(
+      refused([](LatentSpec& s) { s.base = Latent::Base::admissible; }),
+      "latent 'friction': a model has no word for the base admissible; make the prior alone, by make_prior, or take another "
+      "base");
+  EXPECT_EQ(refused([](LatentSpec& s) { s.lengthscale.lower = 0.5; }),
+            "latent 'friction': a model holds both bounds or none, but lengthscale has the lower one alone; give both");
+  EXPECT_THAT(refused([](LatentSpec& s) { s.signal_stddev.upper = 3; }), HasSubstr("signal_stddev has the upper one alone"));
+  EXPECT_THAT(refused([](LatentSpec& s) {
+                s.lengthscales = {{"dx", {.lower = 0.5}}};
+              }),
+              HasSubstr("the lengthscale of 'dx' has the lower one alone"));
+  const std::string both =
+      " beside lengthscales of single features; leave one of them out, or make the prior alone, by make_prior";
+  EXPECT_EQ(refused([](LatentSpec& s) {
+              s.per_direction = true;
+              s.lengthscales = {{"dx", {.initial = 0.5}}};
+            }),
+            "latent 'friction': a model cannot hold per_direction = true" + both);
+  EXPECT_EQ(refused([](LatentSpec& s) {
+              s.kernel = "";
+              s.per_direction = false;
+              s.lengthscales = {{"dx", {.initial = 0.5}}};
+            }),
+            "latent 'friction': a model cannot hold per_direction = false" + both);
+}
+
+TEST(CodeLatents, HaveRangesThatMeanSomething) {
+  const auto refused = [](const Latent::Range& range) {
+    LatentSpec spec = words_of_spec();
+    spec.signal_stddev = range;
+    const std::string text = input_error_of([&] { make_prior(text_bead().system, {spec}); });
+    spec = words_of_spec();
+    spec.lengthscales = {{"x", range}};
+    EXPECT_THAT(input_error_of([&] { make_prior(text_bead().system, {spec}); }),
+                testing::StartsWith("latent 'contact': the lengthscale of 'x': "));
+    return text;
+  };
+  const std::string numbers = "latent 'contact': signal_stddev: its numbers must be positive, or 0 for the default, got ";
+  EXPECT_EQ(refused({.initial = -2}), numbers + "-2");
+  EXPECT_EQ(refused({.upper = std::numeric_limits<double>::infinity()}), numbers + "inf");
+  EXPECT_EQ(refused({.initial = std::numeric_limits<double>::quiet_NaN()}), numbers + "nan");
+  EXPECT_EQ(refused({.lower = 3, .upper = 2}), "latent 'contact': signal_stddev: the lower bound 3 is above the upper one 2");
+  EXPECT_EQ(refused({.initial = 1, .lower = 2, .upper = 3}),
+            "latent 'contact': signal_stddev: it starts at 1, outside its bounds");
+  for (const Latent::Range& half : {Latent::Range{.median = 2}, Latent::Range{.log_stddev = 2}}) {
+    EXPECT_EQ(refused(half), "latent 'contact': signal_stddev: median and log_stddev belong together; give both or none");
+  }
+}
+
 TEST(CodeLatents, AreRefusedWhereTheyDoNotFit) {
   const auto spec_refused = [](const std::function<void(LatentSpec&)>& change) {
     LatentSpec spec = code_of_spec();

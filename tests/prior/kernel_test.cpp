@@ -310,5 +310,18 @@ TEST(KernelTest, AnUnknownOrEmptyKernelIsAnErrorThatNamesThoseThereAre) {
   }
 }
 
+TEST(KernelTest, IsEvaluatedAtPointsOfItsFeaturesWithAValueForEachParameter) {
+  const Kernel kernel = Kernel::parse("se", two_features);
+  const MatrixXd points = MatrixXd::Ones(3, 2);
+  const auto refusal = [&](const MatrixXd& left, const MatrixXd& right, const VectorXd& values) {
+    return test::input_error_of([&] { static_cast<void>(kernel.evaluate(left, right, values)); });
+  };
+  EXPECT_EQ(refusal(MatrixXd::Ones(3, 1), MatrixXd::Ones(3, 1), VectorXd::Ones(2)),
+            "Kernel::evaluate: the points on the left must be 3 × 2, got 3 × 1");
+  EXPECT_EQ(refusal(points, MatrixXd::Ones(4, 3), VectorXd::Ones(2)),
+            "Kernel::evaluate: the points on the right must be 4 × 2, got 4 × 3");
+  EXPECT_EQ(refusal(points, points, VectorXd::Ones(1)), "Kernel::evaluate: values must be 2 × 1, got 1 × 1");
+}
+
 }  // namespace
 }  // namespace gp2

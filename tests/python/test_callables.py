@@ -136,6 +136,57 @@ def test_simulate_stays_on_constraints_with_residuals(surface):
     np.testing.assert_allclose(motion.q, gp2.simulate(text, {"x": 0.9}, np.linspace(0, 5, 11)).q, atol=1e-9)
 
 
+def test_redundant_constraints_are_recognised_at_measured_states_as_those_of_text():
+    text = gp2.System.load(MODELS / "slider_crank.toml")
+    values = {"Jc": 0.004, "Jr": 0.002, "ms": 0.8, "mr": 0.3, "r": 0.1, "l": 0.3, "d": 0.4}
+
+    def mechanics(states, parameters):
+        at = text.evaluate(states, parameters)
+        return at.M, at.A, at.b, at.F
+
+    def residuals(states, p):
+        q1, q2, q3, dq1, dq2, dq3 = states[:, :6].T
+        r, l = p["r"], p["l"]
+        x, y = r * np.cos(q1), r * np.sin(q1)
+        dx, dy = -y * dq1, x * dq1
+        pin_x, dpin_x = x + l * np.cos(q2) - q3, dx - l * np.sin(q2) * dq2 - dq3
+        pin_y, dpin_y = y + l * np.sin(q2), dy + l * np.cos(q2) * dq2
+        rod, drod = (q3 - x) ** 2 + y**2 - l**2, 2 * (q3 - x) * (dq3 - dx) + 2 * y * dy
+        return np.stack([pin_x, dpin_x, pin_y, dpin_y, rod, drod], axis=1)
+
+    code = gp2.System.from_callables(
+        mechanics,
+        constraints={"position": ["pin x", "pin y", "rod"]},
+        residuals=residuals,
+        reads=["q1", "q2", "q3", "dq1", "dq2", "dq3", "u1"],
+        name="crank in code",
+        coordinates=[{"name": "q1", "angle": True}, {"name": "q2", "angle": True}, "q3"],
+        inputs=["u1"],
+        parameters=values,
+        latents=[{"name": "f", "kernel": "se", "features": ["q1", "q3", "dq1", "dq3", "u1"], "directions": "force"}],
+        noise=[0.5, 0.2, 0.05],
+    )
+    log = text.generate(30, seed=1)
+    log = {name: np.array(log[name]) if name.startswith("dd") else np.round(log[name], 6) for name in log.columns}
+    test = np.round(text.states(text.generate(20, seed=2, noise_std=0)), 6)
+    options = {"mean": "force", "restarts": 1, "max_iterations": 0, "threads": 1}
+    expected, got = (gp2.fit(system, log, **options).predict(test) for system in (text, code))
+    np.testing.assert_allclose(got.mean, expected.mean, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(got.std, expected.std, rtol=1e-6, atol=1e-9)
+    assert expected.std.mean() > 0.1
+
+
+def test_what_functions_read_without_declaring_it_is_found(surface, log):
+    reads = ["q1", "q2", "dq1", "dq2", "u1", "u2", "u3"]
+
+    def findings(reads):
+        return [finding.text for finding in gp2.check(as_functions(surface, reads=reads), log) if "declared reads" in finding.text]
+
+    assert findings(reads) == []
+    found = findings([name for name in reads if name != "dq2"])
+    assert len(found) == 1 and found[0].startswith("declared reads: M, A or b depend on dq2, which mechanics_reads (in Python reads) ")
+
+
 def test_start_that_is_not_named_whole_is_told_of_without_residuals():
     def mechanics(states, _):
         x, dx = states[:, 0], states[:, 2]

@@ -154,6 +154,30 @@ TEST(Contact, RestitutionMayDependOnTheSpeedOfTheImpact) {
   }
 }
 
+// 1.5 would create energy
+TEST(Contact, RestitutionOfAProgramIsCheckedToo) {
+  const Model model = ball("0.5");
+  SimulateOptions options;
+  options.times = VectorXd::LinSpaced(2, 0, 1);
+  const VectorXd start = VectorXd::Unit(6, 1), parameters = model.system->parameter_values();
+  const auto error_with = [&](Contact contact) -> std::string {
+    options.contacts = {std::move(contact)};
+    try {
+      static_cast<void>(simulate(*model.system, parameters, model_acceleration(model), start, options));
+      return "";
+    } catch (const Error& error) {
+      return error.what();
+    }
+  };
+  const char* const told = "must lie between 0 and 1, got ";
+  EXPECT_EQ(error_with({.row = 0, .input = 0, .restitution = 1}), "");
+  for (const double e : {1.5, -0.2, std::nan("")}) {
+    EXPECT_THAT(error_with({.row = 0, .input = 0, .restitution = e}), HasSubstr(fmt::format("{}{}", told, e)));
+    EXPECT_THAT(error_with({.row = 0, .input = 0, .restitution_at = [e](const auto&) { return e; }}),
+                HasSubstr(fmt::format("{}{}", told, e)));
+  }
+}
+
 TEST(Contact, WithoutRestitutionIsMadeAtOnce) {
   const Trajectory motion = motion_of(ball("0"), {0, 1, 0, 0}, 1, 11);
   ASSERT_EQ(motion.events.size(), 1U);

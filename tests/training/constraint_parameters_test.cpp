@@ -93,6 +93,14 @@ TEST(ConstraintParameters, AreFoundBesideOthersThatTheConstraintHas) {
   EXPECT_NEAR(found[1].value, 0.25, 0.05);
 }
 
+// Whole steps of Newton's method lead from 1.3 ever farther away.
+TEST(ConstraintParameters, AreFoundWhereResidualsBendAway) {
+  const Model model = bead("x^2 + y^2 - 1 + atan(10*(l - 1))");
+  const std::vector<Found> found = fit_of(model, observe(model, 1e-3, 5), {"l"});
+  EXPECT_NEAR(found[0].value, 1, 4 * found[0].stddev);
+  EXPECT_LT(found[0].stddev, 1e-3);
+}
+
 // A log without positions, which nothing else reads, says nothing of a distance between them.
 TEST(ConstraintParameters, AreAsWellKnownBesideALogThatCannotTell) {
   const Model rod = Model::parse(R"toml(

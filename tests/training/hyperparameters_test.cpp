@@ -5,6 +5,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/training/laplace.hpp"
 #include "input_error.hpp"
 #include "observations_testing.hpp"
 #include "test_models.hpp"
@@ -236,6 +237,27 @@ TEST(HyperparametersTest, AFitLeavesWhatIsHeld) {
   EXPECT_EQ(find(report.hyperparameters, "lengthscale(q1)").value, 0.7);
   EXPECT_EQ(find(report.hyperparameters, "signal_stddev(ddq1)").value, find(all, "signal_stddev(ddq1)").value);
   EXPECT_NE(find(report.hyperparameters, "lengthscale(q2)").value, find(all, "lengthscale(q2)").value);
+}
+
+TEST(HyperparametersTest, AFitHoldsAParameterOfEqualBounds) {
+  const Model& model = test::model("models/surface.toml");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe_drawn(model, 12, true);
+  const std::string name = model.system->parameters().front().name;
+  auto all = default_hyperparameters(prior, observations, {name}, {});
+  Hyperparameter& held = all.back();
+  held.value *= 1.1;
+  held.lower = held.upper = held.value;
+  EXPECT_EQ(held.value_at(held.coordinate()), held.value);
+  FitOptions options;
+  options.n_restarts = 2;
+  options.max_iterations = 15;
+  options.n_threads = 1;
+  const FitReport report = fit(prior, observations, all, options).report;
+  EXPECT_EQ(find(report.hyperparameters, name).value, held.value);
+  EXPECT_NE(find(report.hyperparameters, "signal_stddev(ddq1)").value, find(all, "signal_stddev(ddq1)").value);
+  ASSERT_TRUE(report.uncertainty);
+  EXPECT_EQ(parameter_uncertainty(report, all.size() - 1).stddev, 0);
 }
 
 TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {

@@ -87,6 +87,8 @@ class CsvTable {
   [[nodiscard]] std::string cell(int row, int column) const;
   /// Whether there is nothing in a cell but space.
   [[nodiscard]] bool is_empty(int row, int column) const;
+  /// Whether all cells of a column are empty.
+  [[nodiscard]] bool is_empty(int column) const;
   /// Whether none of its cells holds a number, and one is not empty.
   [[nodiscard]] bool is_text(int column) const;
   [[nodiscard]] int line(int row) const;  // in the file; without one in that which write() makes

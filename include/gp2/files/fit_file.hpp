@@ -75,9 +75,11 @@ struct FitFile {
 };
 
 /// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.
-/// @returns the estimated parameters of the system of a fit that are none of these
+/// @param others  names that mean something else to the caller
+/// @returns the values of `others`, and what else a fit has estimated: parameters of its system, delays and lags
 /// @throws InputError naming the file, an unknown name (with those there are), or a value outside its bounds.
-std::vector<Hyperparameter> read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters);
+std::map<std::string, double> read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters,
+                                                const std::vector<std::string>& others = {});
 /// The same from values at hand.
 /// @param source  stands for them in messages
 void set_start_values(const std::map<std::string, double>& values, const std::string& source,

@@ -31,6 +31,8 @@ struct InverseDynamics {
 /// is 0 in all data is asked for little but what the others cannot do, and without data each is weighed by the acceleration that it makes. Inputs that
 /// say whether a constraint holds, those of contacts and those that a condition reads and no force does, stay. One solve where v is affine in
 /// u; else Newton's method from where they start, with steps damped where they do not help: the nearest of those about it.
+/// A step may lead beyond the data, to where what latents say of an input has died away and no input changes v: such inputs are given
+/// too, and miss more than others may.
 ///
 /// The covariance is J⁺ Σ J⁺ᵀ, Σ that of v, and J⁺ the inverse of J = ∂v/∂u in the same metric: exact where u enters no latent, of first
 /// order in Σ else. Where an input turns around what it does J loses rank, and it is immense or NaN.

@@ -32,7 +32,8 @@ class Likelihood {
     Workers workers = {};                  // on what is made once, where it is through inducing points
   };
 
-  /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.
+  /// @param initial  where the options ask for no parameter's derivative `parameters` stay as they are here, and `noise_stddev` too
+  ///                 unless they ask for the noise's: observations are reduced once then.
   /// @throws InputError when prior, observations, values and options do not fit each other; and as require_mechanics and
   /// require_prior_values, under `initial`.
   Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options);
@@ -60,7 +61,8 @@ class Likelihood {
   ///
   /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the noise
   ///                  or a parameter. Left as it was when the value is +∞.
-  /// @throws InputError when the values do not fit the prior and the observations.
+  /// @throws InputError when the values do not fit the prior and the observations, or differ from `initial` in what stays as it is
+  /// there.
   double evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const;
 
   [[nodiscard]] const Prior& prior() const;

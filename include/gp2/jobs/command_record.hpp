@@ -39,7 +39,8 @@ class CommandRecord {
   [[nodiscard]] bool knows(const Place& place, double reach) const;
   /// By what share of its spread a command changes from row to row, the median of the input that changes most.
   [[nodiscard]] double usual_change() const;
-  /// Whether each input looks as if it had been at rest before the part of a place: it begins at 0, or stays as it is for that time.
+  /// Whether each input looks as if it had been at rest before the part of a place: it begins at 0, or stays as it is for that time,
+  /// to a hundredth of its largest size.
   [[nodiscard]] bool begins_at_rest(const Place& place, double reach) const;
 
   /// Writes what acts at some places into states; where a place is in no part the command stays.
@@ -57,6 +58,7 @@ class CommandRecord {
 
   std::vector<int> inputs_;
   std::vector<Part> parts_;
+  Eigen::VectorXd small_;  // of each input, a hundredth of its largest size
   double usual_step_ = 0;
 };
 

@@ -112,9 +112,10 @@ std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const F
 /// fit() or, of a baseline, fit_baseline(), or fit_robust() where that is asked for.
 Fit fit(const FitProblem& problem, const FitOptions& options);
 
-/// Starting values, as read_start_values. Bounds are the optimiser's: where it does not run, at max_iterations 0, a start outside
-/// of them is taken; they are widened to hold it, and the notes say so.
-void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem);
+/// Starting values, as read_start_values, also of the delays and lags that the fit estimates. Bounds are the optimiser's: where it does
+/// not run, at max_iterations 0, a start outside of them is taken; they are widened to hold it, and the notes say so.
+/// @param actuators  of the model
+void read_start(const NamedNumbers& start, int max_iterations, const std::vector<Actuator>& actuators, FitProblem& problem);
 
 /// What a person should know of a fit: parameters at a bound, uncertainty_notes, and noise at its lower bound.
 std::vector<std::string> notes_of(const FitReport& report, const Posterior& posterior);

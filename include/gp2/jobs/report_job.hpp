@@ -41,6 +41,7 @@ struct LearnedForce {
   Eigen::VectorXd at;              // ascending; of an entry evenly (n)
   Eigen::MatrixXd mean, stddev;    // (d × n)
   Eigen::VectorXd data;            // where the training data are (N)
+  bool are_all_rows = true;        // or some, of many that a fit does not keep
 };
 
 /// What each latent has learned, along the entries of the state that it reads and that change it most.
@@ -85,6 +86,7 @@ struct ReportData {
   Eigen::MatrixXd unconstrained_stddev;  //      (nq × N)
   Eigen::MatrixXd constraint_error;      // |A ddq − b| of the predicted mean, fitted parameters (nc × N)
   Eigen::VectorXd distance;              // from the data, as Posterior::distance_from_data (N)
+  Eigen::MatrixXd truth_inputs;          // what acts by the delays and lags of the truth (nu × N); empty: as in `states`
   Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty where it is not asked for
   std::vector<std::pair<std::string, Eigen::VectorXd>> features;  // φ by name (N each)
   std::optional<ConstraintViolation> violation;

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <functional>
 #include <memory>
 #include <optional>
@@ -49,7 +50,8 @@ class CallableSystem final : public System {
 
     /// How far states are off the constraints, in the order of `constraints`: c and dc/dt of one at position level, c of one at
     /// velocity level, nothing of one at acceleration level (rows × N). Optional: without it `check` holds no state against the
-    /// constraints, `simulate` does not project, so that motions drift off, and `generate` solves for no coordinate.
+    /// constraints, `simulate` does not project, so that motions drift off, `generate` solves for no coordinate, and redundant rows
+    /// are known as such only at states where the constraints hold: leave them out where measured states are used.
     std::function<Eigen::MatrixXd(const States& states, const Parameters& parameters)> residuals;
 
     /// Names of the state's entries (q1, dq1, t, u1, …) that M, A and b read, that F reads, that the residuals read: a log needs
@@ -70,6 +72,10 @@ class CallableSystem final : public System {
 
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
+  /// Found at states where the constraints hold, if all are of positions and there are residuals. The first call looks for such
+  /// states from random ones, by up to some thousand calls of `evaluate` and `residuals` with one state each; it leaves out states
+  /// at which these throw an exception derived from std::exception.
+  [[nodiscard]] int largest_rank() const override;
 
  private:
   void require_shapes(const char* function, const SystemValues& values, Eigen::Index n_states) const;
@@ -79,6 +85,7 @@ class CallableSystem final : public System {
   Definition definition_;
   std::vector<Residual> residual_labels_;
   std::vector<bool> mechanics_reads_, force_reads_, residuals_read_;
+  mutable std::atomic<int> largest_rank_ = -1;  // −1 before the first call
 };
 
 }  // namespace gp2

@@ -67,6 +67,7 @@ LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eige
 /// @param accelerations  (nq × N); states with one that is not measured (NaN) are left out
 /// @param stddev         of their noise (nq × N); NaN, or empty: not known
 /// @returns the rows of ddq to observe instead (the best-conditioned independent set); nothing when the columns are independent.
+/// @throws InputError when a size is wrong; so do those below.
 std::optional<std::vector<int>> dependent_columns(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                   const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
@@ -94,7 +95,7 @@ struct ConstraintResidual {
 
 /// One for each row of A, of which a state at least is measured.
 /// @param accelerations  (nq × N); NaN: not measured
-/// @param stddev         of their noise (nq × N); NaN: not known
+/// @param stddev         of their noise (nq × N); NaN, or empty: not known
 std::vector<ConstraintResidual> constraint_residuals(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                      const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                      const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
@@ -102,9 +103,10 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
 
 /// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank, its rows
 /// neither nearly zero nor nearly redundant, b in the range of A, derivatives in the parameters equal to finite differences, A
-/// and b equal to the second derivative of the constraints along a motion.
+/// and b equal to the second derivative of the constraints along a motion. Of a system without expressions also: does it read no
+/// more of a state than it declares (System::reads)?
 ///
-/// @param states     (layout size × N), as good as on the constraint
+/// @param states     (layout size × N), N ≥ 1, as good as on the constraint
 /// @param n_threads  that may work on it; 0: as many as the machine has
 std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                   const Eigen::Ref<const Eigen::VectorXd>& parameters, int n_threads = 1);
@@ -112,7 +114,7 @@ std::vector<Finding> check_system(const System& system, const Eigen::Ref<const E
 /// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
 ///
 /// @param accelerations  (nq × N); NaN where not measured
-/// @param stddev         of their noise (nq × N); NaN: not known
+/// @param stddev         of their noise (nq × N); NaN, or empty: not known
 /// @param stated         rows of ddq whose standard deviations the log states: those that a fit observes; empty: all
 /// @param estimates_noise  whether deviations that are not stated are only a start, from which a fit finds them
 std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,

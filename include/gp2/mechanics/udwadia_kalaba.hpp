@@ -31,6 +31,7 @@ namespace gp2 GP2_API {
 /// its scale nor units matter.
 ///
 /// For control loops, `compute` takes one object to the next state. Const member functions may be called from several threads.
+/// All functions that take matrices or vectors throw InputError when a size is wrong.
 class UdwadiaKalaba {
  public:
   /// Directions of range(Bᵀ) whose pivot is below this fraction of the largest count as redundant.
@@ -96,7 +97,7 @@ class UdwadiaKalaba {
   /// L as a matrix (nq × nc). With redundant rows it is one of the generalised inverses with A L A = A; only L b is unique.
   [[nodiscard]] Eigen::MatrixXd L() const;
   /// The same, written to L (nq × nc). Allocates nothing.
-  void write_L(Eigen::Ref<Eigen::MatrixXd> L) const { L = L_unit_ * row_scale_.asDiagonal(); }
+  void write_L(Eigen::Ref<Eigen::MatrixXd> L) const;
 
   /// K = (Aᵀ)⁺ on the forces of constraints: λ = K Aᵀλ (nc × nq). Of the multipliers of redundant rows it gives those of minimum
   /// norm.

@@ -71,6 +71,7 @@ class Kernel {
   /// @param right   (m × D)
   /// @param values  parameters, in the order of parameters()
   /// @returns (n × m)
+  /// @throws InputError when the points are not of D features, or there is not one value for each parameter.
   [[nodiscard]] Eigen::MatrixXd evaluate(const Eigen::Ref<const Eigen::MatrixXd>& left,
                                          const Eigen::Ref<const Eigen::MatrixXd>& right,
                                          const Eigen::Ref<const Eigen::VectorXd>& values) const;

@@ -86,8 +86,8 @@ struct PriorOptions {
 };
 
 /// A prior without a model file. Expressions are of the system's coordinates, velocities, t, inputs and parameters.
-/// @throws InputError naming the latent, when a kernel, an expression or a list of code is wrong, or `base` is asked for and there
-///   are several latents.
+/// @throws InputError naming the latent, when a kernel, an expression, a range or a list of code is wrong, or `base` is asked for
+///   and there are several latents.
 Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options = {});
 
 }  // namespace gp2

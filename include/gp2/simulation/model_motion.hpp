@@ -18,19 +18,21 @@ void require_truth(const Model& model);
 /// many calls.
 class ModelMotion {
  public:
+  /// @throws InputError when the model has no system.
   explicit ModelMotion(const Model& model);
 
   /// Whether the truth reads the load.
   [[nodiscard]] bool reads_load() const { return load_ != Load::none; }
   /// The motion under A ddq = b + push.
   /// @param push  (nc), 0 of rows that are not there
+  /// @throws InputError when it is of another size.
   [[nodiscard]] ModelMotion pushed(const Eigen::VectorXd& push) const;
 
   /// @param states  (layout size × N)
   /// @param slip    ε of the soft constraints, A ddq = b + ς ε, of those of each state (soft rows × N); empty: none slips
   /// @return (nq × N), not finite where the truth is not
-  /// @throws InputError as require_mechanics, where M is singular while truth.acceleration is not 0, and where the load has no
-  /// solution.
+  /// @throws InputError when `slip` is of another size, as require_mechanics, where M is singular while truth.acceleration is not 0,
+  /// and where the load has no solution.
   [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                              const Eigen::MatrixXd& slip = {}) const;
   /// ā = M⁻¹(F + truth.force) + truth.acceleration, which nothing constrains (nq × N). @throws as acceleration.

@@ -65,7 +65,7 @@ struct Hyperparameter {
   double value = 0;  // where the first restart starts; the fitted value in a FitReport
   double lower = 0, upper = 0;
   /// Positive by nature: optimised as its logarithm. Else it is optimised in widths of its box, from `lower` on, or in units of
-  /// its `size`.
+  /// its `size`; one that is held in units of its value.
   bool positive = true;
   /// Typical size, where the bounds are no more than limits: random starts are drawn about it, and no scan crosses the box. 0:
   /// the box tells.
@@ -83,7 +83,7 @@ struct Hyperparameter {
 
   /// Within 1e-6 of a bound, on the scale it is optimised on; not where it is held.
   [[nodiscard]] bool at_bound() const;
-  /// Held at its value: its bounds leave it no room.
+  /// Held at its value by a fit: its bounds leave it no room.
   [[nodiscard]] bool is_fixed() const { return lower == upper; }
   [[nodiscard]] bool is_system_parameter() const { return kind == Kind::parameter; }
   /// Entries of a loading enter by C Cᵀ: where all of one latent's that may be negative are 0, so is their gradient.

@@ -27,8 +27,9 @@ struct ParameterUncertainty {
   double lower = 0, upper = 0;  // of the 95 % interval
 };
 /// @param k  index in report.hyperparameters
+/// @throws InputError when there is none of that number.
 ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k);
-/// Of two of them; NaN where it is not known.
+/// Of two of them; NaN where it is not known. @throws as parameter_uncertainty.
 double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l);
 
 /// What a person should know of an uncertainty, and what to do about it.

@@ -1,0 +1,12 @@
+#pragma once
+
+#include "gp2/system.hpp"
+
+namespace gp2::internal {
+
+/// System::largest_rank, found at states where the constraints hold; nc where that is not known: if not all of them are of positions
+/// and hold always, if there are no residuals, or if too few such states are found. A state at which the system throws an exception
+/// is left out.
+int find_largest_rank(const System& system);
+
+}  // namespace gp2::internal
