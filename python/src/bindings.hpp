@@ -35,6 +35,12 @@ void add_excitation(py::module_& module);
 void add_predictor(py::module_& module);
 void add_report(py::module_& module);
 
+/// What a Python function raises to end the program, KeyboardInterrupt or SystemExit. It is no std::exception: nothing that goes on
+/// without a failed call may go on here.
+struct Interruption {
+  py::error_already_set error;
+};
+
 /// gp2.System: a model file.
 struct PySystem {
   std::shared_ptr<const Model> model;

@@ -35,7 +35,12 @@ class Function {
   /// with the GIL held
   template <typename... Arguments>
   py::object operator()(Arguments&&... arguments) const {
-    return (*function_)(std::forward<Arguments>(arguments)...);
+    try {
+      return (*function_)(std::forward<Arguments>(arguments)...);
+    } catch (const py::error_already_set& error) {
+      if (error.matches(PyExc_Exception)) throw;
+      throw Interruption{error};
+    }
   }
 
  private:
@@ -383,7 +388,7 @@ constraints
 derivatives(states, parameters, name) -> (dM, dA, db, dF)
     in one parameter, exact; default: central differences
 residuals(states, parameters) -> (n, rows)
-    c and dc/dt of each constraint at position level, c of each at velocity level; without them motions are not projected, and
+    c1, dc1/dt, c2, dc2/dt, … of the constraints at position level, then c of each at velocity level; without them motions are not projected, and
     rows that follow from others must be left out if states are measured
 reads
     names of the entries of a state that the functions read; a log needs these columns. Default: all, t too

@@ -243,6 +243,8 @@ PYBIND11_MODULE(_gp2, module) {
       input_error(gp2::python::with_keywords(error.what()).c_str());
     } catch (const gp2::NumericalError& error) {
       numerical_error(gp2::python::with_keywords(error.what()).c_str());
+    } catch (gp2::python::Interruption& interruption) {
+      interruption.error.restore();
     }
   });
   gp2::python::add_table(module);

@@ -265,7 +265,7 @@ static int pivoted_qr(int d, int n, real *W, real *tau, int *order, real toleran
     real square = -1;
     for (int j = k; j < n; ++j) {
       const real candidate = dot(d - k, W + d * j + k, W + d * j + k);
-      if (candidate > square) {
+      if (candidate > (1 + @tie@) * square) { /* of equal ones the first */
         square = candidate;
         longest = j;
       }
@@ -385,7 +385,8 @@ static void invert_R_transposed(workspace *w)
 static void decompose_rows(workspace *w)
 {
   w->rank = pivoted_qr(NQ, NC, w->B, w->tau, w->order, @rank_tolerance@);
-{redundant}  if (w->rank > @largest_rank@) w->rank = @largest_rank@; /* off the constraints redundant rows seem to be independent */
+{redundant}  w->is_off_constraints = w->rank > @largest_rank@; /* where redundant rows seem to be independent */
+{redundant}  if (w->is_off_constraints) w->rank = @largest_rank@;
   for (int i = 0; i < NQ * NC; ++i) w->L[i] = 0;
   if (w->rank == 0) { /* nothing constrains the motion */
     for (int i = 0; i < NQ * NQ; ++i) w->T[i] = i % (NQ + 1) == 0;
@@ -484,6 +485,7 @@ static void constrain(workspace *w)
     w->a[i] = sum;
   }
 {if all}
+{redundant}  if (w->is_off_constraints) return; /* the residual is the error of the state */
   for (int k = 0; k < NC; ++k) {
     real sum = @of_whole@w->b_unit[k];
     for (int i = 0; i < NQ; ++i) sum -= w->A_unit[k + NC * i] * w->a[i];

@@ -20,7 +20,7 @@ void Writer::declare_workspace() {
     add(fmt::format("A[{0}], b[{1}], sigma[{1}], weight[{2}]", nc * nq, nc, nq));
     add(fmt::format("B[{0}], A_unit[{0}], b_unit[{1}], row_scale[{1}], residual[{1}], L[{0}], Lb[{2}]", nc * nq, nc, nq));
     add(fmt::format("tau[{}]", nmin));
-    add_workspace(fmt::format("int rank, n_zero_rows, order[{}];", nc));
+    add_workspace(fmt::format("int rank, n_zero_rows, is_off_constraints, order[{}];", nc));
   }
   if (has("several")) {
     add(fmt::format("R[{}], tau2[{}]", nc * nmin, nmin));

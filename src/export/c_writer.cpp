@@ -245,6 +245,7 @@ void Writer::set_sizes() {
       {"lost_pivot", single ? "1e-6f" : "1e-14"},
       {"semidefinite", single ? "5e-6f" : "1e-13"},
       {"singular", single ? "1e-4f" : number(UdwadiaKalaba::mass_tolerance)},
+      {"tie", single ? "1e-5f" : "1e-10"},
       {"rank_tolerance", single ? "1e-5f" : number(UdwadiaKalaba::rank_tolerance)},
       {"largest_rank", std::to_string(system().largest_rank())},
       {"consistency", single ? "1e-3f" : number(UdwadiaKalaba::consistency_tolerance)},

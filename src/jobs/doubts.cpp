@@ -588,7 +588,7 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
 }  // namespace
 
 void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, const std::vector<std::string>& held,
-                const FittedValues& fitted_values, std::vector<std::string>& notes) {
+                const FittedValues& fitted_values, bool has_wrong_rate, std::vector<std::string>& notes) {
   constexpr int enough = 1000, fewest = 10;  // values: a sign or a unit needs no more; states
   constexpr std::size_t most_logs = 10;      // each of which is asked by itself
   const Prior& prior = posterior.prior();
@@ -598,7 +598,7 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   const auto any = [&](const auto& is) { return std::any_of(all.begin(), all.end(), is); };
   if (prior.reference || n_states(all) < fewest || any([](const auto& group) { return bool(group.view().other_system); })) return;
   const bool of_windows = has_sums(all);
-  const bool asks = !of_windows || (!prior.is_nonlinear() && n_states(all) * system.nq() <= 2 * enough);
+  const bool asks = !has_wrong_rate && (!of_windows || (!prior.is_nonlinear() && n_states(all) * system.nq() <= 2 * enough));
   const bool asks_logs = asks && !of_windows && all.size() > 1 && all.size() <= most_logs;
   const int n_some = enough / system.nq();
   const std::vector<Observations> some = of_windows ? all : evenly(all, n_some);

@@ -198,6 +198,8 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   asked.n_inducing = settled_inducing(request, problem, asked);
   asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
+  job.has_wrong_rate = std::ranges::any_of(
+      job.notes, [](const std::string& note) { return note.find(" is not the rate of ") != std::string::npos; });
   note_load_without_force(problem, job.notes);
   job.thin = request.thin && !has_sums(problem.observations) && !problem.robust &&
              request.problem.protocol.name == Protocol::Name::standard;
@@ -353,13 +355,8 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   const FittedValues fitted_values = [&](const std::vector<Observations>& some) {
     return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
   };
-  // a column that is not the rate of another makes sound inputs look wrong
-  const bool has_wrong_rate = std::ranges::any_of(
-      job.notes, [](const std::string& note) { return note.find(" is not the rate of ") != std::string::npos; });
-  if (!has_wrong_rate) {
-    tests.run("the inputs and the logs",
-              [&] { add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, notes); });
-  }
+  tests.run("the inputs and the logs",
+            [&] { add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, job.has_wrong_rate, notes); });
   const std::string correlated = scores ? correlated_text(scores->residuals) : "";
   if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: standard deviations are too small", correlated));
   tests.add_notes(notes);
@@ -418,7 +415,9 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);
     add_tests(job, options, result.report, outcome);
   }
-  for (std::string& note : actuator_notes(job.actuators)) outcome.notes.push_back(std::move(note));
+  if (options.max_iterations > 0) {
+    for (std::string& note : actuator_notes(job.actuators)) outcome.notes.push_back(std::move(note));
+  }
   outcome.file.report = std::move(result.report);
   outcome.file.take_data(outcome.posterior);
   outcome.file.report.actuators = job.actuators;
@@ -435,7 +434,11 @@ FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
     job.actuators = estimate_actuators(job.problem, options);
     for (const ActuatorEstimate& one : job.actuators) values.emplace(one.name, one.value);
   } else {
-    for (const Parameter& late : job.problem.late) values.emplace(late.name, late.value);
+    for (const Parameter& late : job.problem.late) {
+      const auto [lower, upper] = Actuator::bounds(late);
+      job.actuators.push_back({late.name, late.value, not_a_number, lower, upper});
+      values.emplace(late.name, late.value);
+    }
   }
   set_values(values, job.file.model.actuators);
   FitProblem& problem = job.problem;
@@ -478,6 +481,7 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
   FitJob fewer = prepare_fit_again(file, job.options.n_threads);
   fewer.problem.lines = std::move(lines);
   fewer.actuators = job.actuators;
+  fewer.has_wrong_rate = job.has_wrong_rate;
   fewer.options.ranks = job.options.ranks;
   fewer.checkpoint = job.checkpoint;
   FitOutcome outcome = run_fit(fewer, progress, stop);
@@ -536,6 +540,12 @@ FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<vo
     if (fewer.file.report.termination == FitReport::interrupted) return *all;
     std::vector<std::string> notes;
     add_residual_notes(all->posterior, trusted, all->cross_validation->residuals, notes);
+    // rows that are left out tell of no delay that is shorter than what lies between the others
+    const auto tells_delay = [](const std::string& note) { return note.find("er than logged, by ") != std::string::npos; };
+    std::ranges::copy_if(all->notes, std::back_inserter(notes), tells_delay);
+    if (std::ranges::any_of(notes, tells_delay))
+      std::erase_if(fewer.notes,
+                    [](const std::string& note) { return note.find("does not explain what the input") != std::string::npos; });
     take_notes_of_all(std::move(notes), fewer.notes);
     return fewer;
   } catch (const Error& error) {

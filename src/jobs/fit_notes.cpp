@@ -261,11 +261,12 @@ bool predicts_rows_badly(const CrossValidation& of) {
 // Whether what the fit leaves open is more than a sound model would of as many rows: it errs even between them, and far more beyond; or
 // it errs far beyond the noise where it is too sure of itself.
 bool denies_model(const CrossValidation& of, const Evaluation::Part& left_out) {
-  constexpr double between = 2, beyond = 5, far_beyond = 10, worth_a_warning = 0.1;  // times the noise; of the spread
+  constexpr double between = 2, beyond = 5, far_beyond = 10;          // times the noise
+  constexpr double worth_a_warning = 0.1, worth_one_by_itself = 0.2;  // of the spread
   constexpr double low_coverage = 0.9;
   if (of.values.n < enough_rows || !(left_out.nrmse > worth_a_warning)) return false;
   return (of.values.nrmse > between * of.nrmse_of_noise && left_out.nrmse > beyond * of.nrmse_of_noise) ||
-         (left_out.coverage95 < low_coverage && left_out.nrmse > far_beyond * of.nrmse_of_noise);
+         (left_out.coverage95 < low_coverage && left_out.nrmse > std::max(worth_one_by_itself, far_beyond * of.nrmse_of_noise));
 }
 
 // What a model may have wrong that rows left out are predicted badly.

@@ -542,7 +542,7 @@ void read_start(const NamedNumbers& start, int max_iterations, const std::vector
     const auto late = std::ranges::find(problem.late, name, &Parameter::name);
     if (late == problem.late.end()) return false;
     const auto [lower, upper] = Actuator::bounds(*late);
-    if (!(value >= lower && value <= upper)) {
+    if (!(value >= 0) || (max_iterations > 0 && !(value >= lower && value <= upper))) {
       throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", source, name, value, lower, upper));
     }
     late->value = value;

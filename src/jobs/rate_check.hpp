@@ -18,8 +18,9 @@ struct RateColumns {
   bool is_angle = false;  // whose values may be wrapped
   const std::vector<Eigen::RowVectorXd>& rates;
   const std::vector<std::string>& names;
-  std::size_t own = 0;    // which of the rates is said to be the column's
-  bool may_jump = false;  // the column, at impacts, of which its rate shows nothing
+  std::size_t own = 0;                              // which of the rates is said to be the column's
+  bool may_jump = false;                            // the column, at impacts, of which its rate shows nothing
+  const Eigen::RowVectorXd* just_before = nullptr;  // the rate just before each row, where it jumps at rows; null: it does not
 };
 
 /// What else the rate would have to be for the values to follow from it: a factor, a lag, another column. Empty where it is right,

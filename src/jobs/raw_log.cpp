@@ -235,9 +235,16 @@ void RawLog::find_episodes() {
   if (column >= 0) episode_column_ = name;
   std::set<std::string> known;
   std::vector<std::string> labels;
+  std::optional<int> without;  // a row
   for (int row = 0; row < log_.n_rows(); ++row) {
     const std::string label = column < 0 ? "" : log_.cell(row, column);
     if (known.insert(label).second) labels.push_back(label);
+    if (label.empty() && !without) without = row;
+  }
+  if (without && labels.size() > 1) {
+    throw InputError(
+        fmt::format("{}: the cell is empty: rows without an episode belong to none; fill it in, or leave the row out",
+                    log_.place(*without, column)));
   }
   const std::vector<std::string> all_wanted = without_ranges(options_.episodes);
   for (const std::string& wanted : all_wanted) {

@@ -11,6 +11,7 @@
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/simulate.hpp"
@@ -119,14 +120,26 @@ bool contradicts_rate(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& val
   const double n_known = static_cast<double>(is_known.count());
   const double mean = is_known.select(rate, 0).sum() / n_known;
   const double usual = std::sqrt(is_known.select(rate.array() - mean, 0).square().sum() / n_known);
-  double moved = 0, told = 0, largest = 0;
+  // how much farther the value moves to row i than its rate says
+  const auto beyond_rate = [&](Index i) {
+    const double difference = value[i] - value[i - 1];
+    const double moved = is_angle ? std::remainder(difference, 2 * std::numbers::pi) : difference;
+    return moved - (t[i] - t[i - 1]) * (rate[i] + rate[i - 1]) / 2;
+  };
+  double offset = 0, time = 0;  // a rate that is too large throughout is told elsewhere
+  for (Index i = 1; i < t.size(); ++i) {
+    const double by = beyond_rate(i), step = t[i] - t[i - 1];
+    if (!std::isfinite(by) || !(step > 0)) continue;
+    offset += by;
+    time += step;
+  }
+  if (time > 0) offset /= time;
+  double apart = 0, largest = 0;
   for (Index i = first + 1; i < first + n; ++i) {
     const double step = t[i] - t[i - 1];
     if (!(step > 0)) return false;
-    const double difference = value[i] - value[i - 1];
-    moved += is_angle ? std::remainder(difference, 2 * std::numbers::pi) : difference;
-    told += step * (rate[i] + rate[i - 1]) / 2;
-    largest = std::max(largest, std::isnan(moved - told) ? 0 : std::abs(moved - told));
+    apart += beyond_rate(i) - step * offset;
+    largest = std::max(largest, std::isnan(apart) ? 0 : std::abs(apart));
   }
   return largest > small * usual * (t[first + n - 1] - t[first]);
 }
@@ -149,6 +162,27 @@ bool moves_in(const System& system, const MatrixXd& states, const EqualRun& run)
     if (rms(of_run) > small * rms(dq)) return true;
   }
   return false;
+}
+
+// Whether an input comes to a stretch in which it is the same by a usual step, and leaves it by a large one: what was held went on
+// meanwhile. An input that dwells, or is set, does neither within a motion.
+bool was_held(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& u, const EqualRun& run) {
+  constexpr double large = 1.5, long_step = 1.5;  // times what nine of ten steps are below; times the usual step of time
+  const auto first = static_cast<Index>(run.first), end = first + static_cast<Index>(run.n);
+  if (first < 1 || end >= u.size()) return false;
+  std::vector<double> steps, times;
+  for (Index i = 1; i < u.size(); ++i) {
+    const double step = std::abs(u[i] - u[i - 1]);
+    if (step > 0 && i != end) steps.push_back(step);
+    if (t[i] > t[i - 1]) times.push_back(t[i] - t[i - 1]);
+  }
+  if (steps.empty() || times.empty()) return false;
+  const double longest = long_step * median(std::move(times));
+  const auto goes_on = [&](Index i) { return t[i] > t[i - 1] && t[i] - t[i - 1] < longest; };
+  std::ranges::sort(steps);
+  const double usual = steps[steps.size() * 9 / 10];
+  return goes_on(first) && goes_on(end) && std::abs(u[first] - u[first - 1]) <= large * usual &&
+         std::abs(u[end] - u[end - 1]) > large * usual;
 }
 
 }  // namespace
@@ -181,7 +215,8 @@ std::vector<std::string> stuck_channels(const System& system, const MatrixXd& st
     if (still.size() != 1) continue;
     const double value = u[static_cast<Index>(still.front().first)];
     const Eigen::RowVectorXd known = u.array().isNaN().select(value, u);
-    if (value == 0 || value == known.maxCoeff() || value == known.minCoeff() || !moves_in(system, states, still.front()))
+    if (value == 0 || value == known.maxCoeff() || value == known.minCoeff() || !was_held(t, u, still.front()) ||
+        !moves_in(system, states, still.front()))
       continue;
     if (auto text = stuck_text(system.inputs()[static_cast<std::size_t>(k)], still.front())) texts.push_back(*std::move(text));
   }

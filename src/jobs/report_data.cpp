@@ -1,4 +1,5 @@
 #include "jobs/report_data.hpp"
+#include "jobs/acting_inputs.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -110,6 +111,23 @@ void add_entries_not_read(const System& system, LogReader& reader, MatrixXd& sta
   }
 }
 
+// What acts by the delays and lags of the truth, of all inputs that the log has; NaN where that depends on commands before the log.
+MatrixXd inputs_of_truth(const Model& truth, const CsvTable& log, LogReader& reader, MatrixXd states) {
+  const System& system = *truth.system;
+  const StateLayout layout = system.layout();
+  auto inputs = states.bottomRows(layout.nu);
+  inputs.setConstant(not_a_number);
+  add_entries_not_read(system, reader, states);
+  std::vector<std::string> notes;
+  const auto commanded = take_commands(system, without_estimates(truth.actuators), reader, std::nullopt, {}, states, notes);
+  MatrixXd known = MatrixXd::Zero(1, states.cols());
+  if (commanded) clear_unknown(*commanded, log, known, notes);
+  for (Index i = 0; i < known.cols(); ++i) {
+    if (std::isnan(known(0, i))) inputs.col(i).setConstant(not_a_number);
+  }
+  return inputs;
+}
+
 }  // namespace
 
 std::vector<ReportData> training_data(const FitFile& fit, const Posterior& posterior) {
@@ -204,11 +222,8 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   const std::vector<int> rows =
       acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, request.columns, notes), "`data`");
   const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
-  const auto states_under = [&](const std::vector<Actuator>& actuators) {
-    return read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, actuators,
-                           parameters_of(at.view, posterior.values().parameters));
-  };
-  const LogStates log = states_under(at.actuators);
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, at.actuators,
+                                        parameters_of(at.view, posterior.values().parameters));
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
   ReportData data = at_states_of(table.name(), [&] {
     MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
@@ -218,12 +233,10 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   data.source = at.other_system ? fmt::format("{}, of '{}'", table.name(), system.name()) : table.name();
   data.is_test = true;
   data.is_of_other_system = at.other_system != nullptr;
-  if (request.truth && request.truth->system->state_names() == system.state_names() &&
-      !act_alike(request.truth->actuators, at.actuators)) {
-    data.truth_inputs = states_under(request.truth->actuators).states.bottomRows(system.layout().nu);
-  }
   LogReader reader = open_log(*at.model, table, request.columns);
   add_entries_not_read(system, reader, data.states);
+  if (request.truth && request.truth->system->state_names() == system.state_names())
+    data.truth_inputs = inputs_of_truth(*request.truth, table, reader, data.states);
   double unit_of_time = 1;
   const std::vector<std::string> wrong =
       wrong_rates_of(system, at.prior, table, checked_columns(*at.model, {&table}, request.columns), &unit_of_time);

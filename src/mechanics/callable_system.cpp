@@ -176,7 +176,7 @@ std::vector<bool> CallableSystem::reads(SystemPart part) const {
 int CallableSystem::largest_rank() const {
   // a lock could be held by a thread whose function waits for this one, as for Python's; each thread finds the same
   int rank = largest_rank_;
-  if (rank < 0) largest_rank_ = rank = internal::find_largest_rank(*this);
+  if (rank < 0) largest_rank_ = rank = internal::find_largest_rank(*this, /*rows_may_vanish=*/true);
   return rank;
 }
 

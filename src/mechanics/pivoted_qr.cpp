@@ -38,12 +38,14 @@ Index pivoted_qr(Ref<MatrixXd> W, Ref<VectorXd> reflection, Ref<VectorXi> order,
   std::iota(order.begin(), order.end(), 0);
   double smallest_pivot = 0;
   for (Index k = 0; k < std::min(d, n); ++k) {
-    // the longest of the columns that are left; their lengths are computed anew, which is safer than updating them
+    // the longest of the columns that are left; their lengths are computed anew, which is safer than updating them. Of equal ones the
+    // first: rounding decides nothing
+    constexpr double beyond_rounding = 1 + 1e-10;
     Index longest = k;
     double square = -1;
     for (Index j = k; j < n; ++j) {
       const double candidate = dot(column(j) + k, column(j) + k, d - k);
-      if (candidate > square) {
+      if (candidate > beyond_rounding * square) {
         square = candidate;
         longest = j;
       }

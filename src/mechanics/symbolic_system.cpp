@@ -204,7 +204,7 @@ SymbolicSystem::SymbolicSystem(Definition definition)
     }
   }
   residuals_ = Tape(residuals, tape_inputs);
-  largest_rank_ = internal::find_largest_rank(*this);
+  largest_rank_ = internal::find_largest_rank(*this, /*rows_may_vanish=*/false);
 
   state_tape_ = std::make_unique<StateTape>();
   state_tape_->inputs = state_tape_->graph->copy(tape_inputs);

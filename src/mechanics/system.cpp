@@ -142,7 +142,7 @@ double value_beside(const Parameter& parameter, double relative_change) {
 
 }  // namespace
 
-int internal::find_largest_rank(const System& system) {
+int internal::find_largest_rank(const System& system, bool rows_may_vanish) {
   const int nc = system.nc();
   if (nc < 2 || !are_of_positions(system)) return nc;
   constexpr int n_starts = 16, enough = 4;  // states: a mechanism may be singular at some
@@ -162,7 +162,7 @@ int internal::find_largest_rank(const System& system) {
       system.evaluate_into(state, parameters, values);
       const UdwadiaKalaba projection(values.M(0), values.A(0), values.b(0));
       if (!projection.motion_is_determined()) continue;
-      if (projection.is_contradictory(values.F(0))) return nc;
+      if (projection.is_contradictory(values.F(0)) || (rows_may_vanish && projection.n_zero_rows() > 0)) return nc;
       ++n_found;
       largest = std::max(largest, projection.rank());
     } catch (const std::exception&) {

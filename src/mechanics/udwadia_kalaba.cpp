@@ -250,7 +250,9 @@ void UdwadiaKalaba::decompose_rows(int largest_rank) {
   const Index nc = rows_.cols();
   reflection_.resize(std::min(nq, nc));
   order_.resize(nc);
-  const Index rank = std::min<Index>(internal::pivoted_qr(rows_, reflection_, order_, rank_tolerance), largest_rank);
+  const Index found = internal::pivoted_qr(rows_, reflection_, order_, rank_tolerance),
+              rank = std::min<Index>(found, largest_rank);
+  is_off_constraints_ = found > rank;
   rank_ = static_cast<int>(rank);
 
   // nothing constrains the motion: T = I to the bit, so that the force of constraints is 0 and not rounding that looks like news
@@ -402,6 +404,7 @@ void UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar, Ref<VectorXd> dd
   require_shape("UdwadiaKalaba::constrain: ddq", ddq, T_.rows(), 1);
   ddq = Lb_;
   ddq.noalias() += T_ * a_bar;
+  if (is_off_constraints_) return;  // the residual is the error of the state
   VectorXd& residual = workspace.rows_;
   residual = b_unit_;
   residual.noalias() -= A_unit_ * ddq;

@@ -73,8 +73,8 @@ namespace {
 
 double checked_restitution(double value, const Contact& contact) {
   if (value >= 0 && value <= 1) return value;
-  throw InputError(fmt::format("simulate: the restitution of the contact of row {} of A must lie between 0 and 1, got {}",
-                               contact.row + 1, value));
+  throw InputError(
+      fmt::format("the restitution of the contact of row {} of A must lie between 0 and 1, got {}", contact.row + 1, value));
 }
 
 }  // namespace
@@ -87,7 +87,9 @@ Contacts::Contacts(const System& system, const VectorXd& parameters, const Simul
       residuals_(gap_residuals(system, options.contacts)),
       shortest_flight_(options.shortest_flight),
       is_closed_(contacts_.size(), false) {
-  for (const Contact& contact : contacts_) checked_restitution(contact.restitution, contact);
+  for (const Contact& contact : contacts_) {
+    if (!contact.restitution_at) checked_restitution(contact.restitution, contact);
+  }
 }
 
 void Contacts::mark(VectorXd& state, const std::vector<bool>& closed) const {

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include <fmt/format.h>
+
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -47,6 +49,9 @@ void ModeChanges::settle_contacts(PhasePoint& now, bool at_start) {
     } else {
       mode_.contacts.settle(state, rhs_.on_sides_anew(), events_);
     }
+  } catch (const InputError& error) {
+    if (at_start) throw;
+    throw NumericalError(fmt::format("simulate: at t = {:.6g}: {}", now.t, error.what()));
   } catch (const Error& error) {
     if (at_start) throw;
     rhs_.fail(now.t, error.what());

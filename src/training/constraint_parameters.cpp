@@ -104,7 +104,7 @@ LeastSquares solve(const Prior& prior, const std::vector<const Observations*>& g
     };
     const auto part = [&](double share) { return VectorXd(out.value + share * scale.cwiseProduct(step)); };
     double share = 1;
-    constexpr double least = 1e-3;
+    constexpr double least = 1e-8;
     for (; share > least; share /= 2) {
       parameters(indices) = part(share);
       if (size_of(residuals_at(system, groups, parameters)) <= size_of(residuals)) break;
@@ -127,7 +127,7 @@ void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& obs
   for (Hyperparameter& h : hyperparameters) {
     if (!h.is_system_parameter()) continue;
     parameters[h.index] = h.value;
-    indices.push_back(h.index);
+    if (!h.is_fixed()) indices.push_back(h.index);
   }
   for (Hyperparameter& h : hyperparameters) {
     if (h.is_system_parameter() && !h.is_fixed() && !moves_the_system(prior, groups, parameters, h.index)) silent.push_back(&h);

@@ -139,11 +139,13 @@ TEST(ActuatorFit, AStartHasDelaysAndLagsToo) {
   const FitOutcome as_it_is = started_as(estimated, from_file);
   EXPECT_NEAR(as_it_is.file.report.negative_log_likelihood, fit.file.report.negative_log_likelihood, 1e-6);
   EXPECT_EQ(as_it_is.file.model.actuators[0].delay.value, fit.file.model.actuators[0].delay.value);
+  as_it_is.file.write(folder / "again.json");
+  const FitFile read = FitFile::read(folder / "again.json");
+  EXPECT_EQ(evaluate(read, read.posterior(), log, {}).evaluation.nrmse, nrmse(as_it_is, log));
   EXPECT_EQ(started_as(estimated, {.file = "", .values = {{"u.lag", 0.03}}}).file.model.actuators[0].lag.value, 0.03);
-  EXPECT_THAT(input_error_of([&] {
-                started_as(estimated, {.file = "", .values = {{"u.lag", 3}}});
-              }),
-              HasSubstr("u.lag = 3 is outside its bounds [0, 0.1]"));
+  FitRequest beyond = request_for(estimated, log);
+  beyond.start.values = {{"u.lag", 3}};
+  EXPECT_THAT(input_error_of([&] { prepare_fit(beyond); }), HasSubstr("u.lag = 3 is outside its bounds [0, 0.1]"));
   // one that holds them says what it does not take
   const FitJob held = prepared(R"({ name = "u", delay = 0.01 })", from_file);
   EXPECT_THAT(held.notes,

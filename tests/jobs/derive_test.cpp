@@ -750,6 +750,13 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
           "log.csv: no column is a coordinate of 'cart' (q1); the file has: t, angle. Rename them, or give `map=LOGNAME=q1`"));
   EXPECT_THAT(fault(cart_log(), {.episode_column = "run"}), HasSubstr("`episode`: log.csv has no column 'run'; it has: t, q1"));
   EXPECT_THAT(fault(cart_log(), {.episodes = {"3"}}), HasSubstr("`episodes`: log.csv has no column 'episode' to choose from"));
+  const CsvTable without_label = cart_log(
+      [](std::vector<Row>& rows) {
+        for (std::size_t k = 0; k < rows.size(); ++k) rows[k].push_back(k == 7 ? "" : "one");
+      },
+      {"t", "q1", "run"});
+  EXPECT_THAT(fault(without_label, {.episode_column = "run"}),
+              HasSubstr("log.csv: row 8, column 'run': the cell is empty: rows without an episode belong to none"));
   EXPECT_THAT(fault(short_log().table, {.episodes = {"7"}}, pendulum()),
               HasSubstr("`episodes`: simulated log has no episode '7'; it has: 0, 1"));
   EXPECT_THAT(fault(cart_log(), {.keep = {"heat"}}), HasSubstr("`keep`: log.csv has no column 'heat'; it has: t, q1"));

@@ -11,6 +11,8 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "input_error.hpp"
+#include "jobs/data_of_model.hpp"
 #include "jobs/reading_notes.hpp"
 
 namespace gp2 {
@@ -278,6 +280,14 @@ TEST(StuckChannels, AreNotThoseThatRestOrAreHeld) {
                 ddx.segment(60, 30) *= 0.01;
               }),
               IsEmpty());
+  EXPECT_THAT(stuck_in([&](auto states, auto& ddx) {  // the same stop, with an offset of the velocity
+                const double from = states(0, 60) - states(0, 90);
+                states.row(0).segment(60, 30).setConstant(states(0, 60)), states.row(1).segment(60, 30).setZero();
+                ddx.segment(60, 30) *= 0.01;
+                for (Index i = 90; i < 150; ++i) states(0, i) += from;
+                states.row(1).array() += 0.13 * std::sqrt(states.row(1).squaredNorm() / static_cast<double>(states.cols()));
+              }),
+              IsEmpty());
   EXPECT_THAT(stuck_in([&](auto states, auto& ddx) {  // a constant acceleration, that of a fall say
                 for (Index i = 0; i < 40; ++i) {
                   const double t = 0.05 * static_cast<double>(i);
@@ -294,6 +304,14 @@ TEST(StuckChannels, AreNotThoseThatRestOrAreHeld) {
                 for (Index i = 0; i < 150; ++i) states(3, i) = states(3, i / 10 * 10);
               }),
               IsEmpty());
+  EXPECT_THAT(stuck_in([](auto states, auto&) {  // a dwell, after which the input goes on from there
+                const Eigen::RowVectorXd u = states.row(3);
+                for (Index i = 60; i < 150; ++i) states(3, i) = u[std::max<Index>(60, i - 20)];
+              }),
+              IsEmpty());
+  for (const Index begin : {0, 130}) {
+    EXPECT_THAT(stuck_in([&](auto states, auto&) { states.row(3).segment(begin, 20).setConstant(0.4); }), IsEmpty()) << begin;
+  }
   EXPECT_THAT(stuck_in([](auto states, auto&) { states.row(3).segment(40, 30).setZero(); }), IsEmpty()) << "switched off";
   EXPECT_THAT(stuck_in([](auto states, auto&) { states.row(3) = states.row(3).cwiseMin(5).eval(); }), IsEmpty()) << "clipped";
 }
@@ -345,6 +363,20 @@ position = [{}]
   };
   EXPECT_THAT(notes_under(R"({ expr = "5 - x", contact = "taut", restitution = 0.2 })", "\"taut\""), IsEmpty());
   EXPECT_THAT(notes_under("", ""), testing::ElementsAre(HasSubstr("the column lags")));
+}
+
+// A controller holds its inputs from row to row: accelerations jump at the rows, and are not the velocities' by trapezoids.
+TEST(WrongRates, AreNotThoseOfInputsThatAreHeld) {
+  const char* const file = "models/four_bar.toml";
+  const std::string error = test::input_error_of([&] { test::drawn_log(file, 30, 1); });
+  if (error.find("without MuJoCo") != std::string::npos) GTEST_SKIP() << error;
+  for (const std::uint64_t seed : {3U, 4U}) {
+    test::LogData log = test::drawn_log(file, 200, seed);
+    EXPECT_THAT(wrong_rates(*log.model->system, log.states, log.accelerations, false), IsEmpty());
+    log.accelerations.row(0) *= -1;
+    EXPECT_THAT(wrong_rates(*log.model->system, log.states, log.accelerations, false),
+                testing::ElementsAre(testing::StartsWith("ddcrank is not the rate of dcrank")));
+  }
 }
 
 TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {

@@ -176,6 +176,59 @@ def test_redundant_constraints_are_recognised_at_measured_states_as_those_of_tex
     assert expected.std.mean() > 0.1
 
 
+# A body on a rail that docks at t = 5 s. The rows are independent where both are there, whatever the states at which redundancy is looked for.
+def docking(interrupt=None):
+    def mechanics(states, _):
+        if interrupt is not None and len(states) == 1:
+            raise interrupt
+        x, y, z, dx, dy, dz, t, u = states.T
+        n, docked = len(states), t > 5
+        A = np.zeros((n, 2, 3))
+        A[:, 0, :2] = -0.5, 1
+        A[:, 1, 2] = docked
+        return np.broadcast_to(np.eye(3), (n, 3, 3)), A, np.zeros((n, 2)), np.stack([u, 0 * u, 0 * u - 9.81], axis=1)
+
+    def residuals(states, _):
+        x, y, z, dx, dy, dz, t, u = states.T
+        return np.stack([y - 0.5 * x, dy - 0.5 * dx, z * (t > 5), dz * (t > 5)], axis=1)
+
+    return gp2.System.from_callables(
+        mechanics,
+        constraints={"position": ["rail", "dock"]},
+        residuals=residuals,
+        name="docking",
+        coordinates=["x", "y", "z"],
+        inputs=["u"],
+        latents=[{"kernel": "se", "features": ["x", "dx"], "directions": "force"}],
+        noise=0.01,
+    )
+
+
+def docking_log(n=40):
+    random = np.random.default_rng(0)
+    x, dx, u = random.normal(size=(3, n))
+    t = np.linspace(0, 10, n)
+    ddx = (u - 0.3 * dx) / 1.25
+    return {"x": x, "y": 0.5 * x, "z": np.where(t > 5, 0, 1), "dx": dx, "dy": 0.5 * dx, "dz": 0 * t, "t": t, "u": u,
+            "ddx": ddx + 0.01 * random.normal(size=n), "ddy": 0.5 * ddx, "ddz": np.where(t > 5, 0, -9.81)}
+
+
+OPTIONS = {"mean": "force", "restarts": 1, "max_iterations": 0, "threads": 1}
+
+
+def test_a_row_that_code_switches_off_elsewhere_is_not_redundant():
+    log = docking_log()
+    predicted = gp2.fit(docking(), log, **OPTIONS).predict(log | {"u": log["u"] + 3}).mean
+    np.testing.assert_allclose(predicted[:, 1], 0.5 * predicted[:, 0], atol=1e-12)
+    np.testing.assert_allclose(predicted[log["t"] > 5, 2], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit])
+def test_what_ends_python_is_not_taken_for_a_state_without_mechanics(interrupt):
+    with pytest.raises(interrupt):
+        gp2.fit(docking(interrupt()), docking_log(), **OPTIONS)
+
+
 def test_what_functions_read_without_declaring_it_is_found(surface, log):
     reads = ["q1", "q2", "dq1", "dq2", "u1", "u2", "u3"]
 

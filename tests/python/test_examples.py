@@ -84,6 +84,7 @@ def test_parameters_are_found_and_the_mass_only_where_the_log_knows_it(run):
     assert abs(numbers(output, r"bend +(\S+) 1/m   \(true")[0] - 0.5) < 0.005
     learned, believed = numbers(output, r"rms error of ddx: (\S+) m/s²; with the first guess believed: (\S+) m/s²")
     assert learned < 0.05 and 5 * learned < believed
+    assert "the model does not explain what the input push does" in output
     pushed, coasting = numbers(output, r"pushed +(-.*)"), numbers(output, r"coasting +(-?\d.*)")
     assert pushed[0] < -100 and pushed[1] < -2 and pushed[3] < -2 and pushed[4] < -100
     assert min(coasting) > -0.5

@@ -68,6 +68,7 @@ struct FitJob {
   FitFile file;  // all but the observations and the report
   std::vector<std::string> notes;
   bool thin = true;
+  bool has_wrong_rate = false;              // a column of a log is not the rate of another
   std::vector<ActuatorEstimate> actuators;  // that were estimated already
   std::filesystem::path checkpoint;         // of the request
   std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less

@@ -51,7 +51,8 @@ class CallableSystem final : public System {
     /// How far states are off the constraints, in the order of `constraints`: c and dc/dt of one at position level, c of one at
     /// velocity level, nothing of one at acceleration level (rows × N). Optional: without it `check` holds no state against the
     /// constraints, `simulate` does not project, so that motions drift off, `generate` solves for no coordinate, and redundant rows
-    /// are known as such only at states where the constraints hold: leave them out where measured states are used.
+    /// are known as such only at states where the constraints hold: leave them out where measured states are used. Redundancy is
+    /// looked for at random states, and not where a row vanishes at one of them.
     std::function<Eigen::MatrixXd(const States& states, const Parameters& parameters)> residuals;
 
     /// Names of the state's entries (q1, dq1, t, u1, …) that M, A and b read, that F reads, that the residuals read: a log needs

@@ -110,7 +110,8 @@ class UdwadiaKalaba {
   /// v := M⁻¹ v or M'⁻¹ v, v (nq × any). Allocates nothing.
   void solve_mass_in_place(Eigen::Ref<Eigen::MatrixXd> v) const;
 
-  /// The constrained acceleration of an unconstrained one, L b + T ā, with one step of refinement onto A ddq = b.
+  /// The constrained acceleration of an unconstrained one, L b + T ā, with one step of refinement onto A ddq = b, but where
+  /// redundant rows contradict each other by the error of a measured state.
   [[nodiscard]] Eigen::VectorXd constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar) const;
   /// The same, written to ddq (nq), which must not overlap a_bar.
   void constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar, Eigen::Ref<Eigen::VectorXd> ddq, Workspace& workspace) const;
@@ -138,6 +139,7 @@ class UdwadiaKalaba {
   Mass mass_kind_ = Mass::positive_definite;
   int rank_ = 0;
   int n_zero_rows_ = 0;
+  bool is_off_constraints_ = false;  // redundant rows seem to be independent
   double inconsistency_ = 0;
   double size_of_b_ = 0;
   Eigen::MatrixXd mass_;         // M or M'                  (nq × nq)
