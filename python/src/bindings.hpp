@@ -169,6 +169,9 @@ auto run_interruptibly(const Work& work, std::atomic<bool>& stop, std::exception
   } catch (py::error_already_set& error) {
     error.value().attr(attribute) = best;
     throw;
+  } catch (const Interruption& interruption) {
+    interruption.error.value().attr(attribute) = best;
+    throw;
   }
 }
 

@@ -126,14 +126,12 @@ bool contradicts_rate(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& val
     const double moved = is_angle ? std::remainder(difference, 2 * std::numbers::pi) : difference;
     return moved - (t[i] - t[i - 1]) * (rate[i] + rate[i - 1]) / 2;
   };
-  double offset = 0, time = 0;  // a rate that is too large throughout is told elsewhere
+  std::vector<double> offsets;  // a rate that is too large throughout is told elsewhere
   for (Index i = 1; i < t.size(); ++i) {
     const double by = beyond_rate(i), step = t[i] - t[i - 1];
-    if (!std::isfinite(by) || !(step > 0)) continue;
-    offset += by;
-    time += step;
+    if (std::isfinite(by) && step > 0) offsets.push_back(by / step);
   }
-  if (time > 0) offset /= time;
+  const double offset = offsets.empty() ? 0 : median(std::move(offsets));
   double apart = 0, largest = 0;
   for (Index i = first + 1; i < first + n; ++i) {
     const double step = t[i] - t[i - 1];
