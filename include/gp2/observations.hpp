@@ -122,7 +122,7 @@ class Observations {
   void remove_first(int n);
 
   /// σ_i (d) at state i under a noise σ that may differ from noise().stddev(); ∞ where nothing is measured.
-  /// @throws InputError, as the functions below, when there is no such state or row, or σ is not of d numbers.
+  /// @throws InputError as the functions below; when there is no such state or row, or σ is not of d numbers.
   [[nodiscard]] Eigen::VectorXd noise_at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
   /// The same of all states (d × N).
   [[nodiscard]] Eigen::MatrixXd noise_of_values(const Eigen::Ref<const Eigen::VectorXd>& stddev) const;

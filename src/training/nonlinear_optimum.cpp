@@ -134,7 +134,7 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   report.best_restart = first->best_restart;
   report.iterations = first->iterations;
   report.n_escapes = first->n_escapes;
-  report.converged = first->converged && stands;
+  report.converged = first->converged && stands && !is_set(options.stop);
   report.termination = is_set(options.stop) ? FitReport::interrupted : stands ? first->termination : FitReport::unsettled;
   return report;
 }
