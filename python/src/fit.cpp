@@ -277,6 +277,10 @@ void add_fit(py::module_& module) {
              return PyLog{std::move(data), std::move(system)};
            }),
            "data"_a, "system"_a = py::none(), "data: as of fit, without lists and other Logs.")
+      .def("__repr__",
+           [](const PyLog& log) {
+             return log.system ? fmt::format("<gp2.Log of '{}'>", log.system->system().name()) : std::string("<gp2.Log>");
+           })
       .def("__reduce__", [](const py::object& self) {
         const auto& log = self.cast<const PyLog&>();
         return py::make_tuple(py::type::of(self), py::make_tuple(log.data, log.system));
@@ -287,6 +291,7 @@ void add_fit(py::module_& module) {
              return PySideInformation{std::move(view), std::move(data), std::move(latent), std::move(system)};
            }),
            "view"_a, "data"_a, "latent"_a = "", "system"_a = py::none())
+      .def("__repr__", [](const PySideInformation& one) { return fmt::format("<gp2.SideInformation on {}>", one.view); })
       .def("__reduce__", [](const py::object& self) {
         const auto& one = self.cast<const PySideInformation&>();
         return py::make_tuple(py::type::of(self), py::make_tuple(one.view, one.data, one.latent, one.system));

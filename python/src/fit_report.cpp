@@ -193,6 +193,11 @@ void add_fit_report(py::module_& module) {
       .def_readonly("failed_evaluations", &RestartReport::failed_evaluations, "That gave no number.")
       .def_readonly("converged", &RestartReport::converged, "Whether it met its tolerances.")
       .def_readonly("termination", &RestartReport::termination, "Which inequality stopped it.")
+      .def("__repr__",
+           [](const RestartReport& of) {
+             return fmt::format("<gp2.RestartReport: objective {:.6g} after {} iterations, {}>", of.objective, of.iterations,
+                                of.termination);
+           })
       .def(pickled<RestartReport>());
   py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
   define_report(report);

@@ -327,6 +327,12 @@ void add_motion(py::module_& module) {
           "Whose error was above the tolerance, or that had no finite acceleration.")
       .def_property_readonly(
           "evaluations", [](const Motion& m) { return m.trajectory.evaluations; }, "Of the acceleration.")
+      .def("__repr__",
+           [](const Motion& m) {
+             const VectorXd& t = m.trajectory.times;
+             return fmt::format("<gp2.Motion of {} coordinates at {} times, t = {:g} to {:g} s>",
+                                m.trajectory.accelerations.rows(), t.size(), t.minCoeff(), t.maxCoeff());
+           })
       .def(pickled<Motion>());
 }
 
@@ -361,6 +367,11 @@ void add_excitation(py::module_& module) {
           "n_failed", [](const PyExcitation& e) { return e.found.n_failed; }, "That could not be integrated.")
       .def_property_readonly(
           "seconds", [](const PyExcitation& e) { return e.found.seconds; }, "That the search took.")
+      .def("__repr__",
+           [](const PyExcitation& e) {
+             return fmt::format("<gp2.Excitation: standard deviations divided by {:.3g}, by {:.3g} after a random motion>",
+                                e.found.factor, e.found.random_factor);
+           })
       .def(pickled<PyExcitation>());
 }
 

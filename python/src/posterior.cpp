@@ -397,6 +397,10 @@ void add_prediction(py::module_& module) {
       .def(pickled<Prediction>());
 }
 
+std::string coverage_text(const Calibration& c) {
+  return fmt::format("coverage {:.3g}, {:.3g}, {:.3g} at 50, 80, 95 %", c.coverage50, c.coverage80, c.coverage95);
+}
+
 void add_evaluation(py::module_& module) {
   module.attr("FAR_FROM_DATA") = Posterior::far_from_data;
   py::class_<Calibration>(module, "Calibration",
@@ -410,10 +414,15 @@ void add_evaluation(py::module_& module) {
       .def_property_readonly(
           "pit", [](const Calibration& c) { return read_only(to_vector(c.pit)); },
           "Share of measurements in each tenth of their predictive distributions: all 0.1 where errors are as predicted.")
+      .def("__repr__", [](const Calibration& c) { return fmt::format("<gp2.Calibration: {}>", coverage_text(c)); })
       .def(pickled<Calibration>());
   py::class_<Evaluation::Part, Calibration>(module, "EvaluationPart", "Figures of some of the points.")
       .def_readonly("n", &Evaluation::Part::n, "Of these points.")
       .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.")
+      .def("__repr__",
+           [](const Evaluation::Part& of) {
+             return fmt::format("<gp2.EvaluationPart of {} points: nrmse {:.4g}; {}>", of.n, of.nrmse, coverage_text(of));
+           })
       .def(pickled<Evaluation::Part>());
   py::class_<LeftOutScores>(module, "LeftOutScores", "Scores of the data of one view, where the fit has not seen them.")
       .def_readonly("view", &LeftOutScores::view, "Such as multipliers; empty: the accelerations.")

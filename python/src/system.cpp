@@ -286,6 +286,7 @@ void add_mechanics_and_finding(py::module_& module) {
       .def_readonly("A", &Mechanics::A, "Constraint matrix (n, nc, nq).")
       .def_readonly("b", &Mechanics::b, "Constraint vector (n, nc).")
       .def_readonly("F", &Mechanics::F, "Known part of the applied force (n, nq) [N or N m].")
+      .def("__repr__", [](const Mechanics& of) { return fmt::format("<gp2.Mechanics at {} states>", of.M.shape(0)); })
       .def(pickled<Mechanics>());
 
   py::class_<Finding>(module, "Finding", "One thing a check looked at.")

@@ -23,6 +23,12 @@ namespace {
 
 constexpr const char* format_name = "gp2 fit";
 
+bool is_code(const Model& model, const Model* other) { return model.code || (other != nullptr && other->code); }
+
+PriorAt at(const Prior& fitted, const View& view, const VectorXd& parameters) {
+  return {prior_of(fitted, view), parameters_of(view, parameters)};
+}
+
 }  // namespace
 
 FitFile::FitFile(Model fitted_model, FitPriorOptions options_of_prior, const Fit& fit,
@@ -43,7 +49,7 @@ FitFile::FitFile(Model fitted_model, FitPriorOptions options_of_prior, const Fit
     }
     if (view.other_system) other = make_other_system(model, *systems[g], prior_options);
     const PriorAt here = {other ? other->prior : made, other ? other->parameters(parameters) : parameters};
-    const PriorAt there = {prior_of(fit.posterior.prior(), view), parameters_of(view, parameters)};
+    const PriorAt there = at(fit.posterior.prior(), view, parameters);
     const std::string differs = difference_at(observations[g], here, there);
     if (differs.empty()) continue;
     throw InputError(
@@ -102,6 +108,7 @@ void FitFile::write(const std::filesystem::path& path) const {
   const Prior fitted = prior();
   require_observations(fitted, observations);
   require_hyperparameters(fitted, observations, report.hyperparameters);
+  const VectorXd parameters = model_values(fitted, observations, report.hyperparameters).parameters;
   json["hyperparameters"] = hyperparameters_json(report.hyperparameters, fitted);
   json["report"] = report_json(report);
   if (notes) json["report"]["notes"] = *notes;
@@ -121,6 +128,8 @@ void FitFile::write(const std::filesystem::path& path) const {
       throw InputError(fmt::format("{}: the model file of the system of observations {} is not given", path.string(), g + 1));
     }
     json["observations"].push_back(observations_json(observations[g], fitted, other));
+    if (is_code(model, other) && observations[g].n_data() > 0)
+      json["observations"].back()["code"] = code_json(at(fitted, observations[g].view(), parameters), observations[g]);
   }
   json["checksum"] = checksum_of(ParsedJson(json));
   // a path in `data_source` may hold bytes that are no text
@@ -201,6 +210,12 @@ FitFile fit_from(ParsedJson& json, const ModelCode& code) {
   fit.report.hyperparameters = hyperparameters_from(json.at("hyperparameters"));
   locate_in_model(fit.report.hyperparameters, prior, fit.observations);
   read_report(json.at("report"), prior, fit.observations, fit.report);
+  const VectorXd parameters = model_values(prior, fit.observations, fit.report.hyperparameters).parameters;
+  for (std::size_t g = 0; g < fit.observations.size(); ++g) {
+    const ParsedJson& group = json.at("observations")[g];
+    if (is_code(fit.model, fit.systems[g].get()) && group.contains("code"))  // since 0.2.0
+      require_code(group.at("code"), at(prior, fit.observations[g].view(), parameters), fit.observations[g]);
+  }
   if (json.at("report").contains("notes")) fit.notes = json.at("report").at("notes").get<std::vector<std::string>>();
   if (json.contains("actuators")) fit.report.actuators = actuators_from(json.at("actuators"), fit.model.actuators);
   return fit;

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "files/json_values.hpp"
+#include "files/prior_difference.hpp"
 #include "gp2/files/fit_file.hpp"
 
 // The parts of a FIT.json, each written by …_json and read by …_from.
@@ -27,6 +28,12 @@ void locate_in_model(std::vector<Hyperparameter>& hyperparameters, const Prior& 
 /// @param other  the model of its view's other system; null: none
 Json observations_json(const Observations& group, const Prior& fitted, const Model* other);
 Observations observations_from(const ParsedJson& json, const Prior& fitted, std::shared_ptr<const OtherSystem> other_system);
+
+// code_json.cpp: what code that a file cannot hold says at a few states of the data
+Json code_json(const PriorAt& at, const Observations& group);
+/// @throws InputError naming what the code given says otherwise.
+void require_code(const ParsedJson& json, const PriorAt& at, const Observations& group);
+
 Json logs_json(const std::vector<LogFile>& logs);
 std::vector<LogFile> logs_from(const ParsedJson& json);
 

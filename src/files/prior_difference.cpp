@@ -65,28 +65,27 @@ std::string difference_at(const Observations& group, const PriorAt& made, const 
   }
   const std::string latents = difference_of_latents(made.prior, fitted.prior);
   if (!latents.empty()) return latents;
-  const auto evaluate = [&](const PriorAt& at) {
-    MechanicsBatch mechanics;
-    evaluate_mechanics(*at.prior.system, group.states(), at.parameters, mechanics);
-    return mechanics;
-  };
-  const MechanicsBatch here = evaluate(made), there = evaluate(fitted);
-  const SystemValues &a = here.values, &b = there.values;
-  if (!are_same(a.mass, b.mass) || !are_same(a.constraint_matrix, b.constraint_matrix) ||
-      !are_same(a.constraint_vector, b.constraint_vector)) {
-    return "M, A or b";
+  const std::vector<PriorPart> here = parts_at(made, group.states()), there = parts_at(fitted, group.states());
+  const auto [mine_differs, its_differs] =
+      std::ranges::mismatch(here, there, [](const PriorPart& x, const PriorPart& y) { return are_same(x.values, y.values); });
+  return its_differs == there.end() ? "" : its_differs->what;
+}
+
+std::vector<PriorPart> parts_at(const PriorAt& at, const Eigen::Ref<const MatrixXd>& states) {
+  MechanicsBatch mechanics;
+  evaluate_mechanics(*at.prior.system, states, at.parameters, mechanics);
+  PriorValues prior = evaluate_prior(at.prior, states, at.parameters, mechanics);
+  SystemValues& values = mechanics.values;
+  std::vector<PriorPart> parts = {{"M", std::move(values.mass)},
+                                  {"A", std::move(values.constraint_matrix)},
+                                  {"b", std::move(values.constraint_vector)},
+                                  {"the prior mean", std::move(prior.mean)}};
+  for (std::size_t a = 0; a < at.prior.latents.size(); ++a) {
+    const std::string& name = at.prior.latents[a].name;
+    parts.push_back({fmt::format("the directions of the latent '{}'", name), std::move(prior.directions[a])});
+    parts.push_back({fmt::format("the features of the latent '{}'", name), evaluate_features(at.prior, a, states).transpose()});
   }
-  const PriorValues x = evaluate_prior(made.prior, group.states(), made.parameters, here);
-  const PriorValues y = evaluate_prior(fitted.prior, group.states(), fitted.parameters, there);
-  if (!are_same(x.mean, y.mean)) return "the prior mean";
-  for (std::size_t k = 0; k < x.directions.size(); ++k) {
-    const std::string& name = fitted.prior.latents[k].name;
-    if (!are_same(x.directions[k], y.directions[k])) return fmt::format("the directions of the latent '{}'", name);
-    if (!are_same(evaluate_features(made.prior, k, group.states()), evaluate_features(fitted.prior, k, group.states()))) {
-      return fmt::format("the features of the latent '{}'", name);
-    }
-  }
-  return "";
+  return parts;
 }
 
 }  // namespace gp2

@@ -262,6 +262,23 @@ def test_fit_is_saved_without_the_functions_and_loaded_with_them(surface, log, t
         gp2.load(tmp_path / "fit.json")
 
 
+def test_fit_is_not_loaded_with_other_functions_than_it_had(surface, log, tmp_path):
+    gp2.fit(as_functions(surface), log, mean="force", max_iterations=0).save(tmp_path / "fit.json")
+
+    def other(part, factor):
+        def mechanics(states, values):
+            at = surface.evaluate(states, values)
+            return tuple(factor * value if name == part else value for name, value in zip("MAbF", (at.M, at.A, at.b, at.F), strict=True))
+
+        return as_functions(surface, mechanics=mechanics)
+
+    for part, name in {"M": "M", "A": "A", "b": "b", "F": "the prior mean"}.items():
+        said = f"the code given is not that of this fit: at state 1 of its data an entry of {name} is "
+        with pytest.raises(gp2.InputError, match=said):
+            gp2.load(tmp_path / "fit.json", other(part, 1.001))
+        gp2.load(tmp_path / "fit.json", other(part, 1 + 1e-12))  # as another machine rounds
+
+
 def test_several_threads_take_turns_in_the_functions(surface, log):
     """Functions with a state of their own, which give wrong numbers if another thread comes in between."""
     buffer = {}

@@ -122,8 +122,7 @@ def test_results_survive_a_pickle(posterior, arm, arm_log, arm_states, oscillato
         for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
             assert type(again) is type(result) and again is not result
             np.testing.assert_equal(public_values(again), public_values(result))
-            if "object at" not in repr(result):
-                assert repr(again) == repr(result)
+            assert "object at" not in repr(result) and repr(again) == repr(result)
     report = pickle.loads(pickle.dumps(posterior.report))
     assert report.correlation("m2", "m2") == posterior.report.correlation("m2", "m2")
     assert list(pickle.loads(pickle.dumps(posterior.predict(arm_states))).to_frame()) == list(posterior.predict(arm_states).to_frame())
