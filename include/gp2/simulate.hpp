@@ -25,7 +25,7 @@ using Acceleration = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen:
 using PushedAcceleration = std::function<Acceleration(const Eigen::VectorXd& push)>;
 
 /// Inputs over time: zero, or a table of commands that is linear in between and held at its ends, as their actuators follow it,
-/// exactly; they are at rest before the table.
+/// exactly; before the table they are constant, at its first values.
 class InputSignal {
  public:
   InputSignal() = default;  // zero

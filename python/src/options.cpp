@@ -139,7 +139,9 @@ std::string literal(const std::vector<std::string>& words) {
 std::string type_of(const OptionValue& value) {
   const auto kinds = Overloaded{
       [](const bool*) { return "bool"; },
-      [](const Switch&) { return "bool"; },
+      [](const Switch& one) {
+        return "bool | " + literal({one.on, one.off});
+      },
       [](const YesByDefault&) { return "bool"; },
       [](const int*) { return "int"; },
       [](const std::uint64_t*) { return "int"; },
@@ -300,8 +302,10 @@ std::string signature(const std::string& function, const std::string& first, con
 std::string documentation(const std::vector<Option>& options) {
   std::string text;
   for (const Option& option : options) {
-    text += fmt::format("{:<19} {}{}\n", keyword_of(option), with_keywords(option.text),
-                        option.otherwise.empty() ? "" : fmt::format("; default: {}", option.otherwise));
+    const auto* const words = std::get_if<Switch>(&option.value);
+    text += fmt::format("{:<19} {}{}{}\n", keyword_of(option), with_keywords(option.text),
+                        option.otherwise.empty() ? "" : fmt::format("; default: {}", option.otherwise),
+                        words != nullptr ? fmt::format("; True is '{}', False '{}'", words->on, words->off) : "");
   }
   return text;
 }

@@ -36,7 +36,8 @@ struct CSource {
 /// rounding of the n additions may make up to n/8 + 16 times as much.
 ///
 /// @throws InputError as require_view; when the name is no C identifier, there are no observations, the system, features or
-///   directions are code and not expressions, or single precision is off by more than a hundredth of a standard deviation.
+///   directions are code and not expressions, or single precision is off: the mean by more than a
+///   fiftieth of a standard deviation, or a variance by more than a twentieth of itself.
 [[nodiscard]] CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options = {});
 
 }  // namespace gp2
