@@ -139,7 +139,8 @@ Curvature curvature_of(std::vector<int> free, VectorXd gradient, const MatrixXd&
   out.free = std::move(free);
   out.gradient = std::move(gradient);
   if (out.free.empty()) return out;
-  out.unit = H.diagonal().array().abs().max(1e-10).rsqrt();
+  // deviations of ten boxes and of twenty thousand are alike unknown: what rounding makes of nothing is not to be taken for a curvature
+  out.unit = H.diagonal().array().abs().max(1e-2).rsqrt();
   const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(MatrixXd(out.unit.asDiagonal() * H * out.unit.asDiagonal()));
   out.eigenvalues = eigen.eigenvalues();
   out.eigenvectors = eigen.eigenvectors();

@@ -496,6 +496,10 @@ HyperparameterDraws draw_about(const Objective& objective, const std::vector<std
   summarise(values, out);
   out.r_hat = drawn.r_hat();
   out.effective_size = drawn.effective_size();
+  for (Index k = 0; k < values.rows(); ++k) {
+    // of equal values they would be rounding
+    if (!out.is_drawn(k)) out.r_hat[k] = 1, out.effective_size[k] = static_cast<double>(n_steps);
+  }
   out.n_chains = static_cast<int>(starts.size());
   out.evaluations = drawn.evaluations;
   out.acceptance = drawn.acceptance;

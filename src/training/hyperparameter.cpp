@@ -44,7 +44,17 @@ bool Hyperparameter::at_bound() const {
   if (is_fixed()) return false;
   const double tolerance = 1e-6;
   if (positive) return std::log(value / lower) <= tolerance || std::log(upper / value) <= tolerance;
-  return value - lower <= tolerance * (upper - lower) || upper - value <= tolerance * (upper - lower);
+  const auto is_near = [&](double bound) {
+    // of a box far wider than the bound is large, that part may be larger than the value
+    const double within = tolerance * (upper - lower);
+    return std::abs(value - bound) <= (bound == 0 ? within : std::min(within, 1e-3 * std::abs(bound)));
+  };
+  return is_near(lower) || is_near(upper);
+}
+
+void Hyperparameter::hold() {
+  if (!positive && size == 0) size = upper - lower;
+  lower = upper = value;
 }
 
 void Hyperparameter::write(ModelValues& values) const {

@@ -207,12 +207,19 @@ std::string changes_along(const std::vector<Hyperparameter>& hyperparameters, co
   return fmt::format("{}", fmt::join(changes, ", "));
 }
 
-void note_distance(const LaplaceUncertainty& uncertainty, const std::vector<int>& parameters,
-                   std::vector<UncertaintyNote>& notes) {
-  constexpr double far = 0.5;  // standard deviations
+constexpr double far_from_optimum = 0.5;  // standard deviations
+
+// Whether the optimiser was stopped on its way, where all seems undetermined.
+bool is_on_the_way(const FitReport& report) {
+  return !report.converged && report.uncertainty->distance_from_optimum > far_from_optimum;
+}
+
+void note_distance(const FitReport& report, const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
+  const LaplaceUncertainty& uncertainty = *report.uncertainty;
   const double distance = uncertainty.distance_from_optimum;
-  if (!(distance > far)) return;
-  const bool has_open = std::ranges::any_of(parameters, [&](int k) { return std::isinf(uncertainty.stddev[k]); });
+  if (!(distance > far_from_optimum)) return;
+  const bool has_open =
+      !is_on_the_way(report) && std::ranges::any_of(parameters, [&](int k) { return std::isinf(uncertainty.stddev[k]); });
   notes.push_back({true,
                    fmt::format("the standard errors are rough: the optimiser stopped {}",
                                std::isfinite(distance) ? fmt::format("{:.2g} standard deviations before the optimum", distance)
@@ -346,8 +353,8 @@ std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
     if (fitted[static_cast<std::size_t>(k)].is_system_parameter()) parameters.push_back(k);
   }
   std::vector<UncertaintyNote> notes;
-  note_distance(*report.uncertainty, parameters, notes);
-  note_open_parameters(fitted, *report.uncertainty, parameters, notes);
+  note_distance(report, parameters, notes);
+  if (!is_on_the_way(report)) note_open_parameters(fitted, *report.uncertainty, parameters, notes);
   note_silent_parameters(fitted, *report.uncertainty, parameters, notes);
   note_pairs(fitted, *report.uncertainty, parameters, notes);
   note_held(fitted, *report.uncertainty, parameters, notes);

@@ -94,6 +94,7 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   once.standard_errors = false;
   std::optional<FitReport> first, last;
   double objective = std::numeric_limits<double>::infinity();
+  int n_iterations = 0;
   bool stands = options.max_iterations == 0, is_stuck = false;
   // Where no latent acts the load is that of known forces. Beside it what presses on a constraint and what rubs there are found both
   // wrong, and each holds the other so. Without a mean at the start there is nothing better.
@@ -104,6 +105,7 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
     hyperparameters = report.hyperparameters;
     stands = std::abs(report.objective - objective) < enough;
     objective = report.objective;
+    n_iterations += report.iterations;
     if (!first) first = report;
     last = std::move(report);
     if (is_set(options.stop)) break;
@@ -118,24 +120,32 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   }
   once.n_draws = options.n_draws;
   once.standard_errors = options.standard_errors;
-  FitReport report = last && is_set(options.stop)
-                         ? *std::move(last)
-                         : trained(prior, observations, hyperparameters, once, linearisation.approximation());
+  FitReport report;
+  if (last && is_set(options.stop)) {
+    report = *std::move(last);
+  } else {
+    report = trained(prior, observations, hyperparameters, once, linearisation.approximation());
+    n_iterations += report.iterations;
+  }
   if (!first) return report;
   // the last run may leave the hyperparameters that have a mean
   if (linearisation.has_mean() && !is_set(options.stop) && !linearisation.move_to(report.hyperparameters)) {
     report.hyperparameters = linearisation.last();
     report.objective = report.negative_log_likelihood + negative_log_hyperpriors(report.hyperparameters, nullptr);
     report.uncertainty.reset();
+    report.draws.reset();
     stands = false;
   }
-  // the run that searched is told of, not those that stood where it ended
+  // the restarts are those of the run that searched
   report.restarts = std::move(first->restarts);
   report.best_restart = first->best_restart;
-  report.iterations = first->iterations;
+  report.iterations = n_iterations;
   report.n_escapes = first->n_escapes;
-  report.converged = first->converged && stands && !is_set(options.stop);
-  report.termination = is_set(options.stop) ? FitReport::interrupted : stands ? first->termination : FitReport::unsettled;
+  report.converged = report.converged && stands && !is_set(options.stop);
+  if (is_set(options.stop))
+    report.termination = FitReport::interrupted;
+  else if (!stands)
+    report.termination = FitReport::unsettled;
   return report;
 }
 

@@ -255,7 +255,8 @@ class Training {
               has_bounded ? curvature_at(objective_, coordinates(at), at, evaluators_, options_.stop, AtBound::free_if_open)
                           : curvature,
               at);
-          restore_undetermined(from, workspace);
+          // far from an optimum all seems undetermined
+          if (reports_[from].converged || curvature.distance_from_optimum() <= near) restore_undetermined(from, workspace);
           return;
         }
         VectorXd scales = VectorXd::Ones(static_cast<Index>(at.size()));
@@ -282,8 +283,8 @@ class Training {
     const double objective = objective_(coordinates(restored), nullptr, workspace);
     if (!(objective <= report.objective + 1e-9 * (1 + std::abs(report.objective)))) return;
     results_[from] = std::move(restored);
-    report.objective = objective;
-    report.negative_log_likelihood = objective - negative_log_hyperpriors(results_[from], nullptr);
+    // the objective stays: one that is higher by rounding would make another restart the best
+    report.negative_log_likelihood = report.objective - negative_log_hyperpriors(results_[from], nullptr);
   }
 
   void store(std::size_t restart, const LbfgsbResult& result) {

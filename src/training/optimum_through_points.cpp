@@ -103,9 +103,7 @@ class TrainingThroughPoints {
     options.standard_errors = false;
     options.improved = nullptr;
     for (Hyperparameter& h : hyperparameters) {
-      if (!h.is_system_parameter() && h.kind != Hyperparameter::Kind::noise_stddev) continue;
-      if (!h.positive && h.size == 0) h.size = h.upper - h.lower;  // its unit stays
-      h.lower = h.upper = h.value;
+      if (h.is_system_parameter() || h.kind == Hyperparameter::Kind::noise_stddev) h.hold();
     }
     try {
       return trained_exactly(prior_, some, hyperparameters, options).draws;

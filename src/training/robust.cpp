@@ -1,6 +1,7 @@
 #include "gp2/training/robust.hpp"
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -16,6 +17,7 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "inference/requirements.hpp"
+#include "training/constraint_parameters.hpp"
 #include "training/hamiltonian.hpp"
 
 namespace gp2 {
@@ -242,8 +244,37 @@ std::vector<Observations> without_gross_errors(std::vector<Observations> observa
 
 MatrixXd without_gross_errors(const MatrixXd& values) { return without_far_values(values, gross); }
 
+namespace {
+
+// Draws about a fit, under which its posterior is from then on.
+void add_draws(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options, Fit& out) {
+  // what is not drawn is to be the same in the report and in each of the draws
+  std::vector<Hyperparameter> about = out.report.hyperparameters;
+  const std::vector<bool> held = held_in_draws(prior, observations, about);
+  for (std::size_t k = 0; k < held.size(); ++k) {
+    if (held[k]) about[k].hold();
+  }
+  try {
+    out.report.draws = fit(prior, observations, about, options).report.draws;
+  } catch (const NumericalError&) {
+    if (!is_set(options.stop)) throw;
+  }
+  if (is_set(options.stop)) {
+    out.report.converged = false;
+    out.report.termination = FitReport::interrupted;
+  }
+  if (!out.report.draws) return;
+  if (out.report.inducing) out.report.inducing->summary = nullptr;  // which was of the optimum
+  const Workers workers(thread_count(options.n_threads), options.ranks);
+  out.posterior = possible_posterior(prior, observations, out.report, workers);
+  if (out.report.inducing) out.report.inducing->summary = out.posterior.summary();
+}
+
+}  // namespace
+
 Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations,
                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, const RobustOptions& robust) {
+  const auto start = std::chrono::steady_clock::now();
   require_observations(prior, observations);
   require_hyperparameters(prior, observations, hyperparameters);
   if (!(robust.threshold > 0)) {
@@ -269,24 +300,13 @@ Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations
   search.run(search.best_choice(), hyperparameters, full);
   Fit out = search.best();
   out.report.distrusted.insert(out.report.distrusted.begin(), impossible.begin(), impossible.end());
-  if (options.n_draws == 0 || is_set(options.stop)) return out;
-  FitOptions about_best = quick;
-  about_best.n_draws = options.n_draws;
-  about_best.standard_errors = false;
-  try {
-    out.report.draws = fit(prior, search.best_choice().observations, out.report.hyperparameters, about_best).report.draws;
-  } catch (const NumericalError&) {
-    if (!is_set(options.stop)) throw;
+  if (options.n_draws > 0 && !is_set(options.stop)) {
+    FitOptions about_best = quick;
+    about_best.n_draws = options.n_draws;
+    about_best.standard_errors = false;
+    add_draws(prior, search.best_choice().observations, about_best, out);
   }
-  if (is_set(options.stop)) {
-    out.report.converged = false;
-    out.report.termination = FitReport::interrupted;
-  }
-  if (!out.report.draws) return out;
-  if (out.report.inducing) out.report.inducing->summary = nullptr;  // which was of the optimum
-  const Workers workers(thread_count(options.n_threads), options.ranks);
-  out.posterior = possible_posterior(prior, search.best_choice().observations, out.report, workers);
-  if (out.report.inducing) out.report.inducing->summary = out.posterior.summary();
+  out.report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return out;
 }
 

@@ -470,6 +470,13 @@ TEST(HyperparametersTest, ABoundIsReportedWhenItIsHit) {
     parameter.value = value;
     EXPECT_FALSE(parameter.at_bound()) << value;
   }
+  // a mass of 1 kg is not at its bound of 1 mg because it might be 5000 t
+  parameter.lower = 1e-6;
+  parameter.upper = 5e6;
+  parameter.value = 1;
+  EXPECT_FALSE(parameter.at_bound());
+  parameter.value = 1e-6;
+  EXPECT_TRUE(parameter.at_bound());
 }
 
 }  // namespace

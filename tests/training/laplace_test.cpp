@@ -228,6 +228,25 @@ TEST(LaplaceTest, ParametersKnownToAMillionthOfTheirBoxAreFittedToTheirOptimum) 
   EXPECT_LT(std::abs(report.hyperparameters.back().value - 0.5), 4 * report.uncertainty->stddev[last]);
 }
 
+// With a mean of zero and M = m I the projection knows no m: what rounding makes of nothing is no curvature, and another restart is no
+// better by it.
+TEST(LaplaceTest, WhatNothingDependsOnIsNotKnownAndStaysAtItsStart) {
+  const Model& model = test::model("models/surface.toml");
+  for (const std::uint64_t seed : {laplace_seed, laplace_seed + 1, laplace_seed + 2}) {
+    SCOPED_TRACE(seed);
+    DrawnProblem p = laplace_problem(model, 40, {}, seed, 0.1);
+    p.prior = make_prior(model, {Prior::Mean::zero, std::nullopt});
+    p.hyperparameters = default_hyperparameters(p.prior, p.observations, {"m"}, {});
+    FitOptions options = one_run();
+    options.n_restarts = 3;
+    const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+    ASSERT_TRUE(report.uncertainty.has_value());
+    ASSERT_EQ(report.hyperparameters.back().name, "m");
+    EXPECT_TRUE(std::isinf(report.uncertainty->stddev[report.uncertainty->stddev.size() - 1]));
+    EXPECT_EQ(report.hyperparameters.back().value, p.hyperparameters.back().value);
+  }
+}
+
 // √r has no value left of r = 0: nothing to take differences of
 TEST(LaplaceTest, AFitAtTheEdgeOfItsModelSaysThatItHasNoStandardErrors) {
   const std::string text = test::changed(line().text, {{"p*x + r", "p*x + sqrt(r)"}, {"value = 0.2", "value = 1e-7"}});
@@ -346,6 +365,11 @@ TEST(LaplaceTest, NotesNameASingleOpenParameterManyCombinationsAndFitsThatStoppe
   EXPECT_FALSE(uncertainty_notes(report)[0].is_warning);
   EXPECT_EQ(uncertainty_notes(report)[0].text,
             "m and Ic are known much better together than each by itself (correlation -0.9910)");
+  // on the way to an optimum all seems open
+  u.stddev[0] = u.distance_from_optimum = infinity;
+  u.undetermined = Eigen::Vector3d(1, 0, 0);
+  EXPECT_EQ(uncertainty_notes(report).at(0).mend, "Fit with a larger `max_iterations`, or `start` from this fit");
+  report.converged = true;
   // along what is open no optimum is near
   u.stddev[0] = u.distance_from_optimum = infinity;
   u.undetermined = Eigen::Vector3d(1, 0, 0);

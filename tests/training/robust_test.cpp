@@ -158,6 +158,26 @@ TEST(RobustTest, ThroughInducingPointsEachDrawHasSumsOfItsOwn) {
             robust.posterior.negative_log_likelihood());
 }
 
+// Parameters of constraints are not drawn: they are those of the report in every draw, under which the fit has its posterior.
+TEST(RobustTest, WhatIsNotDrawnIsTheSameInReportAndDraws) {
+  Data data = with_outliers(data_of("models/surface.toml", 40), 0.03, false);
+  data.hyperparameters = default_hyperparameters(data.prior, without_gross_errors(data.observations), {"p1", "p2"}, {});
+  FitOptions options = quick_robust();
+  options.max_iterations = 15;
+  options.n_draws = 4;
+  const FitReport report = fit_robust(data.prior, data.observations, data.hyperparameters, options).report;
+  ASSERT_TRUE(report.draws.has_value());
+  int n_held = 0;
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const auto at = static_cast<Index>(k);
+    if (!report.hyperparameters[k].is_system_parameter()) continue;
+    ++n_held;
+    EXPECT_TRUE((report.draws->values.row(at).array() == report.hyperparameters[k].value).all());
+    EXPECT_EQ(report.draws->r_hat[at], 1);
+  }
+  EXPECT_EQ(n_held, 2);
+}
+
 TEST(RobustTest, OfCleanDataNextToNothingIsDistrusted) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
     SCOPED_TRACE(fmt::format("{}, seed {}", file, robust_seed));

@@ -81,8 +81,10 @@ struct Hyperparameter {
   /// A hyperparameter of no name and value: positive unless of the system's parameters or a loading.
   static Hyperparameter of(Kind kind, std::size_t owner, std::size_t index);
 
-  /// Within 1e-6 of a bound, on the scale it is optimised on; not where it is held.
+  /// Within 1e-6 of a bound, on the scale it is optimised on, and within 1e-3 of the bound's own size; not where it is held.
   [[nodiscard]] bool at_bound() const;
+  /// Holds it at its value; its unit stays.
+  void hold();
   /// Held at its value by a fit: its bounds leave it no room.
   [[nodiscard]] bool is_fixed() const { return lower == upper; }
   [[nodiscard]] bool is_system_parameter() const { return kind == Kind::parameter; }
