@@ -113,9 +113,12 @@ class System {
   [[nodiscard]] const std::vector<std::string>& constraint_conditions() const { return constraint_conditions_; }
   [[nodiscard]] bool is_conditional(int row) const { return !constraint_conditions_[static_cast<std::size_t>(row)].empty(); }
   [[nodiscard]] bool has_conditional_constraints() const;
-  /// The largest rank of A where the constraints hold. Off them, as measured states are, rows that follow from others there seem to
-  /// be independent: what they have beyond this rank is the error of the state, and no constraint. nc where it is not known.
+  /// The largest rank of A where the constraints hold and every condition is met: that of the rows that are always there, and one
+  /// more for each conditional row. Off the constraints, as measured states are, rows that follow from others on them seem to be
+  /// independent: what they have beyond this rank is the error of the state, and no constraint. nc where it is not known.
   [[nodiscard]] virtual int largest_rank() const { return nc(); }
+  /// The same at a state: less the conditional rows that are 0 in its A (nc × nq). nc where largest_rank() is. Allocates nothing.
+  [[nodiscard]] int largest_rank_of(const Eigen::Ref<const Eigen::MatrixXd>& A) const;
   [[nodiscard]] int nq() const { return static_cast<int>(coordinates_.size()); }
   [[nodiscard]] int nc() const { return static_cast<int>(constraint_labels_.size()); }
   [[nodiscard]] StateLayout layout() const { return {nq(), static_cast<int>(inputs_.size())}; }

@@ -89,7 +89,7 @@ int Writer::rank_at(const VectorXd& state) const {
   if (system().nc() == 0) return 0;
   values_->evaluate(state);
   UdwadiaKalaba projection;
-  projection.compute(values_->M(), values_->A(), values_->b(), system().largest_rank());
+  projection.compute(values_->M(), values_->A(), values_->b(), system().largest_rank_of(values_->A()));
   return projection.rank();
 }
 

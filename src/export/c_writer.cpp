@@ -37,6 +37,18 @@ const std::set<std::string>& taken_names() {
   return names;
 }
 
+// System::largest_rank_of, at the workspace's state: `row_scale` is 0 of a row that vanishes.
+std::string largest_rank_in_c(const System& system) {
+  int n_always = system.largest_rank();
+  std::string others;
+  for (int row = 0; row < system.nc(); ++row) {
+    if (!system.is_conditional(row)) continue;
+    --n_always;
+    others += fmt::format(" + (w->row_scale[{}] != 0)", row);
+  }
+  return std::to_string(n_always) + others;
+}
+
 }  // namespace
 
 bool is_identifier(const std::string& text) {
@@ -247,7 +259,7 @@ void Writer::set_sizes() {
       {"singular", single ? "1e-4f" : number(UdwadiaKalaba::mass_tolerance)},
       {"tie", single ? "1e-5f" : "1e-10"},
       {"rank_tolerance", single ? "1e-5f" : number(UdwadiaKalaba::rank_tolerance)},
-      {"largest_rank", std::to_string(system().largest_rank())},
+      {"largest_rank", largest_rank_in_c(system())},
       {"consistency", single ? "1e-3f" : number(UdwadiaKalaba::consistency_tolerance)},
       {"well_conditioned", single ? "1e-2f" : "1e-4"},
       {"small_norm", single ? "1e-15f" : "1e-140"},

@@ -283,7 +283,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
 
   void write_root() {
     mechanics->evaluate(state);
-    projection.compute(mechanics->M(), mechanics->A(), mechanics->b(), solver->prior.system->largest_rank());
+    projection.compute(mechanics->M(), mechanics->A(), mechanics->b(), solver->prior.system->largest_rank_of(mechanics->A()));
     const std::vector<int>& rows = solver->predictor.view().rows;
     for (std::size_t i = 0; i < rows.size(); ++i) {
       for (std::size_t j = 0; j < rows.size(); ++j) {

@@ -162,8 +162,7 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
   if (latent.base != Latent::Base::admissible) return;
   at.of_directions->evaluate(VectorXd::Zero(predictor->prior.system->layout().size()), at.directions);
-  at.admissible.emplace(predictor->prior.system->largest_rank())
-      .compute(MatrixXd::Ones(predictor->prior.system->nc(), nq), at.directions.reshaped(nq, nq));
+  at.admissible.emplace().compute(MatrixXd::Ones(predictor->prior.system->nc(), nq), at.directions.reshaped(nq, nq));
   at.admissible->set_functions(at.signal);
 }
 
@@ -171,7 +170,7 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
 
 Status Predictor::Implementation::evaluate_mechanics(StateEvaluator& at, Workspace::Implementation& w) const {
   if (!is_finite(at.M()) || !is_finite(at.A()) || !is_finite(at.b())) return Status::not_finite;
-  w.projection.compute(at.M(), at.A(), at.b(), prior.system->largest_rank());
+  w.projection.compute(at.M(), at.A(), at.b(), prior.system->largest_rank_of(at.A()));
   switch (w.projection.mass_kind()) {
     case UdwadiaKalaba::Mass::positive_definite:
       break;
@@ -223,7 +222,7 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       if (here.of_directions) here.of_directions->evaluate(state, here.directions);
       if (here.admissible) {
         const Map<const MatrixXd> B(here.directions.data(), w.a_bar.size(), w.a_bar.size());
-        here.directions = here.admissible->compute(at.A(), B).reshaped();
+        here.directions = here.admissible->compute(at.A(), B, prior.system->largest_rank_of(at.A())).reshaped();
       }
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }

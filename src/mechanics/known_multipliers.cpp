@@ -15,12 +15,12 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
-void KnownMultipliers::compute(const Matrix& M, const Matrix& A, const Vector& b, const Vector& F) {
+void KnownMultipliers::compute(const Matrix& M, const Matrix& A, const Vector& b, const Vector& F, int largest_rank) {
   M_ = M;
   A_ = A;
   lambda_.setConstant(A.rows(), not_a_number);
   if (!M.allFinite() || !A.allFinite() || !b.allFinite() || !F.allFinite()) return;
-  projection_.compute(M, A, b, largest_rank_);
+  projection_.compute(M, A, b, largest_rank);
   if (!projection_.motion_is_determined()) return;
 
   a_bar_ = F;
@@ -127,12 +127,12 @@ Multipliers multipliers_in(std::span<const Expression> expressions, const System
 MatrixXd with_known_multipliers(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
   MatrixXd out(states.rows() + system.nc(), states.cols());
   out.topRows(states.rows()) = states;
-  KnownMultipliers multipliers(system.largest_rank());
+  KnownMultipliers multipliers;
   SystemValues values;
   in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
     system.evaluate_into(block, parameters, values);
     for (int i = 0; i < values.n_states(); ++i) {
-      multipliers.compute(values.M(i), values.A(i), values.b(i), values.F(i));
+      multipliers.compute(values.M(i), values.A(i), values.b(i), values.F(i), system.largest_rank_of(values.A(i)));
       out.col(first + i).tail(system.nc()) = multipliers.values();
     }
   });

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <optional>
 #include <span>
 #include <string>
@@ -30,10 +31,10 @@ class KnownMultipliers {
   using Vector = Eigen::Ref<const Eigen::VectorXd>;
   using Quantity = StateEvaluator::Quantity;
 
-  explicit KnownMultipliers(int largest_rank) : largest_rank_(largest_rank) {}
-
   /// NaN where nothing determines the motion, or a number is not finite.
-  void compute(const Matrix& M, const Matrix& A, const Vector& b, const Vector& F);
+  /// @param largest_rank  System::largest_rank_of(A)
+  void compute(const Matrix& M, const Matrix& A, const Vector& b, const Vector& F,
+               int largest_rank = std::numeric_limits<int>::max());
   [[nodiscard]] const Eigen::VectorXd& values() const { return lambda_; }  // λ₀ (nc)
 
   /// The derivatives of λ₀ at this state in n variables follow from those of M, A, b and F, which are added one by one.
@@ -42,7 +43,6 @@ class KnownMultipliers {
   [[nodiscard]] const Eigen::MatrixXd& derivatives();  // (nc × n)
 
  private:
-  int largest_rank_;  // of the system
   UdwadiaKalaba projection_;
   UdwadiaKalaba::Workspace workspace_;
   Eigen::MatrixXd M_, A_, K_, L_;

@@ -1,8 +1,10 @@
 #include "mechanics/largest_rank.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <exception>
+#include <optional>
 #include <vector>
 
 #include <Eigen/QR>
@@ -14,37 +16,52 @@ namespace gp2 {
 
 namespace {
 
-// Whether each row of A is that of a constraint c = 0 of positions, which holds always, and has the residuals c and ċ.
-bool are_of_positions(const System& system) {
+// Constraints c = 0 of positions that hold always.
+struct UnconditionalRows {
+  std::vector<int> rows;                      // of A
+  std::array<std::vector<int>, 2> residuals;  // which of System::residuals are their c, their ċ
+};
+
+// Nothing where a constraint that holds always is not of positions, or lacks its residuals.
+std::optional<UnconditionalRows> find_unconditional_rows(const System& system) {
+  UnconditionalRows found;
+  for (int row = 0; row < system.nc(); ++row) {
+    if (!system.is_conditional(row)) found.rows.push_back(row);
+  }
+  std::array<std::vector<int>, 2> rows;  // of the residuals
   const std::vector<System::Residual>& labels = system.residual_labels();
-  if (system.has_conditional_constraints() || std::ssize(labels) != 2 * system.nc()) return false;
   for (int k = 0; k < static_cast<int>(labels.size()); ++k) {
     const System::Residual& label = labels[static_cast<std::size_t>(k)];
-    if (label.row != k / 2 || label.velocity != (k % 2 == 1)) return false;
+    if (system.is_conditional(label.row)) continue;
+    found.residuals[label.velocity ? 1 : 0].push_back(k);
+    rows[label.velocity ? 1 : 0].push_back(label.row);
   }
-  return true;
+  if (rows[0] != found.rows || rows[1] != found.rows) return std::nullopt;
+  return found;
 }
 
 // Moves a state onto constraints of positions, by Newton's method with the least change. False where this does not converge, or the
 // residuals are not those of A.
-bool meet_constraints(const System& system, const Eigen::VectorXd& parameters, Eigen::MatrixXd& state) {
+bool meet_constraints(const System& system, const UnconditionalRows& unconditional, const Eigen::VectorXd& parameters,
+                      Eigen::MatrixXd& state) {
   constexpr int max_iterations = 50;
   constexpr double redundant = 1e-8, met = 1e-8;  // of the largest singular value; of the lengths
   const Eigen::Index nq = system.nq();
   auto q = state.col(0).head(nq), dq = state.col(0).segment(nq, nq);
   SystemValues values;
+  Eigen::MatrixXd A;
   Eigen::VectorXd c, step;
-  // the first of each constraint is c, the second ċ
-  const auto find_residual = [&](int level) {
-    c = system.residuals(state, parameters).reshaped(2, system.nc()).row(level).transpose();
+  const auto find_residual = [&](std::size_t level) {  // of positions, of velocities
+    c = system.residuals(state, parameters).col(0)(unconditional.residuals[level]);
     return c.allFinite();
   };
-  const auto find_step = [&](int level) {
+  const auto find_step = [&](std::size_t level) {
     system.evaluate_into(state, parameters, values);
-    if (!find_residual(level) || !values.A(0).allFinite()) return false;
+    A = values.A(0)(unconditional.rows, Eigen::all);
+    if (!find_residual(level) || !A.allFinite()) return false;
     Eigen::CompleteOrthogonalDecomposition<Eigen::MatrixXd> decomposition;
     decomposition.setThreshold(redundant);
-    step = -decomposition.compute(values.A(0)).solve(c);
+    step = -decomposition.compute(A).solve(c);
     return step.allFinite();
   };
   bool has_converged = false;
@@ -54,7 +71,7 @@ bool meet_constraints(const System& system, const Eigen::VectorXd& parameters, E
     has_converged = step.norm() <= 1e-12 * (1 + q.norm());
   }
   // constraints that contradict each other have a nearest state too
-  const Eigen::ArrayXd lengths = values.A(0).rowwise().norm();
+  const Eigen::ArrayXd lengths = A.rowwise().norm();
   if (!has_converged || (c.array().abs() > met * (1 + q.norm()) * lengths).any() || !find_step(1)) return false;
   dq += step;
   // ċ is linear in dq: one step meets it, if A is ∂ċ/∂dq
@@ -74,11 +91,13 @@ double value_beside(const Parameter& parameter, double relative_change) {
 
 int internal::find_largest_rank(const System& system, bool rows_may_vanish) {
   const int nc = system.nc();
-  if (nc < 2 || !are_of_positions(system)) return nc;
+  const std::optional<UnconditionalRows> unconditional = find_unconditional_rows(system);
+  if (!unconditional || unconditional->rows.size() < 2) return nc;
+  const auto n_unconditional = static_cast<int>(unconditional->rows.size());
   constexpr int n_starts = 16, enough = 4;  // states: a mechanism may be singular at some
   RandomStream random(0);
   int n_found = 0, largest = 0;
-  for (int start = 0; start < n_starts && n_found < enough && largest < nc; ++start) {
+  for (int start = 0; start < n_starts && n_found < enough && largest < n_unconditional; ++start) {
     Eigen::MatrixXd state(system.layout().size(), 1);
     for (double& entry : state.reshaped()) entry = random.normal();
     // nor may rows follow from others at the model's own parameters alone, as where some are 0
@@ -87,10 +106,10 @@ int internal::find_largest_rank(const System& system, bool rows_may_vanish) {
       parameters[k] = value_beside(system.parameters()[static_cast<std::size_t>(k)], 0.1 * random.normal());
     }
     try {
-      if (!meet_constraints(system, parameters, state)) continue;
+      if (!meet_constraints(system, *unconditional, parameters, state)) continue;
       SystemValues values;
       system.evaluate_into(state, parameters, values);
-      const UdwadiaKalaba projection(values.M(0), values.A(0), values.b(0));
+      const UdwadiaKalaba projection(values.M(0), values.A(0)(unconditional->rows, Eigen::all), values.b(0)(unconditional->rows));
       if (!projection.motion_is_determined()) continue;
       if (projection.is_contradictory(values.F(0)) || (rows_may_vanish && projection.n_zero_rows() > 0)) return nc;
       ++n_found;
@@ -99,7 +118,7 @@ int internal::find_largest_rank(const System& system, bool rows_may_vanish) {
       // code may have no answer at a state of no log
     }
   }
-  return n_found < enough || largest == 0 ? nc : largest;
+  return n_found < enough || largest == 0 ? nc : largest + nc - n_unconditional;
 }
 
 }  // namespace gp2

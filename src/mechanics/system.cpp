@@ -30,6 +30,13 @@ bool System::has_conditional_constraints() const {
   return std::any_of(constraint_conditions_.begin(), constraint_conditions_.end(), [](const auto& one) { return !one.empty(); });
 }
 
+int System::largest_rank_of(const Eigen::Ref<const Eigen::MatrixXd>& A) const {
+  int rank = largest_rank();
+  if (rank == nc()) return rank;
+  for (int row = 0; row < nc(); ++row) rank -= is_conditional(row) && A.row(row).isZero(0) ? 1 : 0;
+  return rank;
+}
+
 std::vector<std::string> System::state_names() const {
   std::vector<std::string> names;
   for (const Coordinate& coordinate : coordinates_) names.push_back(coordinate.name);

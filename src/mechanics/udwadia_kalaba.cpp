@@ -548,7 +548,7 @@ double evaluate_each(const System& system, const Ref<const MatrixXd>& states, co
   double size_of_b = 0;
   for (int i = 0; i < n_states; ++i) {
     UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
-    projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i), system.largest_rank());
+    projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i), system.largest_rank_of(batch.values.A(i)));
     if (std::optional<std::string> text = fault_at(system, batch.values, states, i, projection)) {
       batch.fault = {i, std::move(*text)};
       break;

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <utility>
 
 #include <fmt/format.h>
@@ -21,13 +22,12 @@ class AdmissibleDirections {
  public:
   using Matrix = Eigen::Ref<const Eigen::MatrixXd>;
 
-  explicit AdmissibleDirections(int largest_rank) : largest_rank_(largest_rank) {}
-
-  /// @param A  (nc × nq)
-  /// @param B  diagonal (nq × nq), positive
+  /// @param A             (nc × nq)
+  /// @param B             diagonal (nq × nq), positive
+  /// @param largest_rank  System::largest_rank_of(A)
   /// @returns E (nq × nq), NaN where B is not finite
   /// @throws NumericalError where W⁻¹ overflows or underflows.
-  const Eigen::MatrixXd& compute(const Matrix& A, const Matrix& B) {
+  const Eigen::MatrixXd& compute(const Matrix& A, const Matrix& B, int largest_rank = std::numeric_limits<int>::max()) {
     if (b_.size() != A.rows()) b_.setZero(A.rows());
     stddev_ = B.diagonal();
     if (!stddev_.allFinite()) {  // as B is where an entry of the state is not known: who asked tells of it
@@ -35,7 +35,7 @@ class AdmissibleDirections {
       return E_;
     }
     mass_ = stddev_.cwiseAbs2().cwiseInverse().asDiagonal();
-    projection_.compute(mass_, A, b_, largest_rank_);
+    projection_.compute(mass_, A, b_, largest_rank);
     if (!projection_.motion_is_determined()) {
       throw NumericalError(fmt::format(
           "directions that the constraints leave: deviations from {:.3g} to {:.3g} have no squares to compute with in "
@@ -68,7 +68,6 @@ class AdmissibleDirections {
   }
 
  private:
-  int largest_rank_;  // of the system
   Eigen::VectorXd stddev_, b_;
   Eigen::MatrixXd mass_, E_, L_;
   Eigen::VectorXd Ef_, scaled_, multipliers_;

@@ -54,9 +54,9 @@ MatrixXd LoadFunction::differentiate(const States& states, const Parameters& par
   x.topRows(n_state) = states;
   MatrixXd through_lambda0 = MatrixXd::Zero(size(), states.cols());
   VectorXd slopes(std::ssize(entries));
-  KnownMultipliers lambda0(system_->largest_rank());
+  KnownMultipliers lambda0;
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
-    lambda0.compute(values.M(i), values.A(i), values.b(i), values.F(i));
+    lambda0.compute(values.M(i), values.A(i), values.b(i), values.F(i), system_->largest_rank_of(values.A(i)));
     lambda0.start_derivatives(1);
     for (Index column = 0; column < nq; ++column) {
       for (Index row = 0; row < nq; ++row) lambda0.add_derivative(Quantity::mass, row, column, 0, d.M(i)(row, column));
@@ -80,11 +80,11 @@ MatrixXd LoadFunction::differentiate(const States& states, const Parameters& par
 class LoadFunction::ChainEvaluator final : public Evaluator {
  public:
   ChainEvaluator(const LoadFunction& of, const Parameters& parameters)
-      : n_state_(of.system_->layout().size()),
+      : of_system_(*of.system_),
+        n_state_(of.system_->layout().size()),
         function_(of.function_->make_evaluator(parameters)),
         system_(of.system_->make_evaluator(parameters_of(*of.system_, parameters), false)),
         system_and_derivatives_(of.system_->make_evaluator(parameters_of(*of.system_, parameters), true)),
-        lambda0_(of.system_->largest_rank()),
         x_(n_state_ + of.system_->nc()),
         slopes_(std::ssize(function_->entries())) {
     MatrixXi depends = MatrixXi::Zero(of.size(), n_state_);
@@ -140,7 +140,7 @@ class LoadFunction::ChainEvaluator final : public Evaluator {
  private:
   void take(const Ref<const VectorXd>& state, StateEvaluator& at) {
     at.evaluate(state);
-    lambda0_.compute(at.M(), at.A(), at.b(), at.F());
+    lambda0_.compute(at.M(), at.A(), at.b(), at.F(), of_system_.largest_rank_of(at.A()));
     x_.head(n_state_) = state;
     x_.tail(x_.size() - n_state_) = lambda0_.values();
   }
@@ -152,6 +152,7 @@ class LoadFunction::ChainEvaluator final : public Evaluator {
     static_cast<void>(lambda0_.derivatives());
   }
 
+  const System& of_system_;
   Index n_state_;
   std::unique_ptr<Evaluator> function_;
   std::unique_ptr<StateEvaluator> system_, system_and_derivatives_;

@@ -165,8 +165,11 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
         block(E, i, nq) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(E, i, nq));
       }
     } else if (latent.base == Latent::Base::admissible) {
-      AdmissibleDirections directions(prior.system->largest_rank());
-      for (int i = 0; i < n_states; ++i) block(E, i, nq) = directions.compute(mechanics.values.A(i), block(E, i, nq));
+      AdmissibleDirections directions;
+      for (int i = 0; i < n_states; ++i) {
+        const auto A = mechanics.values.A(i);
+        block(E, i, nq) = directions.compute(A, block(E, i, nq), prior.system->largest_rank_of(A));
+      }
     }
     values.directions.push_back(std::move(E));
   }
@@ -205,9 +208,10 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));
     } else if (latent.base == Latent::Base::admissible) {
       MatrixXd all = evaluate_base(latent, states, parameters, nq, nullptr);
-      AdmissibleDirections directions(prior.system->largest_rank());
+      AdmissibleDirections directions;
       for (int i = 0; i < n_states; ++i) {
-        directions.compute(mechanics.values.A(i), block(all, i, nq));
+        const auto A = mechanics.values.A(i);
+        directions.compute(A, block(all, i, nq), prior.system->largest_rank_of(A));
         block(dE, i, nq) = directions.differentiate(derivative.A(i));
       }
     }

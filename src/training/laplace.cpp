@@ -131,7 +131,9 @@ bool draws_know_parameters(const FitReport& report) {
 double stddev_under_actuators(const FitReport& report, std::size_t k) {
   const auto at = static_cast<Index>(k);
   if (report.hyperparameters[k].at_bound()) return not_a_number;
-  const double by_curvature = report.uncertainty ? report.uncertainty->stddev[at] : not_a_number;
+  // which of a positive one is that of its logarithm
+  const double unit = report.hyperparameters[k].positive ? report.hyperparameters[k].value : 1;
+  const double by_curvature = report.uncertainty ? unit * report.uncertainty->stddev[at] : not_a_number;
   // draws of what the data leave open tell the width of its bounds, or how far a chain got
   const bool is_of_draws = draws_know_parameters(report) && report.draws->is_drawn(at) && !std::isinf(by_curvature);
   return is_of_draws ? report.draws->stddev[at] : by_curvature;

@@ -649,6 +649,47 @@ directions = "force"
                 "rank of A from 2 to 3. Leave out rows that follow from others, or leave `float` out"));
 }
 
+// Measured states, where the second row seems to be independent of the first, and the third comes and goes.
+TEST(CSourceTest, KnowsRedundantRowsBesideAConditionalOne) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "2", "0"], ["0", "0", "1"]]
+force = ["-x", "1", "-9.81"]
+[constraints]
+position = ["x - y", "sin(x) - sin(y)", { expr = "z - 0.1*x", contact = "touch" }]
+[[latent]]
+kernel     = "se"
+features   = ["dx", "dz"]
+directions = "force"
+)toml",
+                                   "carts");
+  RandomStream random(export_seed);
+  MatrixXd states(8, 12);  // x y z dx dy dz t touch
+  for (double& entry : states.reshaped()) entry = 2 * random.uniform() - 1;
+  states.row(1) = states.row(0);
+  states.row(4) = states.row(3);
+  for (Index i = 0; i < states.cols(); ++i) {
+    states(7, i) = static_cast<double>(i % 2);
+    if (i % 2 == 0) continue;
+    states(2, i) = 0.1 * states(0, i);
+    states(5, i) = 0.1 * states(3, i);
+  }
+  const View view = View::constrained_acceleration(*model.system);
+  Problem p{model.name, make_prior(model, {Prior::Mean::force, std::nullopt, false}), {}, {}, states, {}};
+  p.observations.push_back(test::observe(model, view, states, random));
+  p.values = test::random_values(p.prior, p.observations, random);
+  const Posterior posterior = test::posterior_of(p);
+  const CSource source = export_c(posterior, view);
+  EXPECT_THAT(source.source, HasSubstr("w->rank > 1 + (w->row_scale[2] != 0);"));
+  Exported c(source, "gp2_model", "gcc -O1");
+  EXPECT_EQ(c.self_test(c.workspace()), 0);
+  MatrixXd measured = states.replicate(1, 8);
+  for (double& entry : measured.topRows(6).reshaped()) entry += 1e-4 * (2 * random.uniform() - 1);
+  EXPECT_EQ(expect_predictor(posterior, view, c, measured, p), measured.cols());
+}
+
 TEST(CSourceTest, IsNotCompiledWithoutNaN) {
   const CSource c = export_c(test::posterior_of(problem_of("surface")), problem_of("surface").observations[0].view());
   for (const char* const option : {"-ffast-math", "-ffinite-math-only"}) {

@@ -304,6 +304,70 @@ directions = "force"
   }
 }
 
+// States off the constraints, as measured ones are, where only a row that comes and goes is independent of the first
+TEST(PredictorTest, RedundantRowsAreNoneBesideAConditionalOne) {
+  const auto model_of = [](const std::string& redundant) {
+    return Model::parse(fmt::format(R"toml(
+name        = "carts"
+coordinates = ["x", "y", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "2", "0"], ["0", "0", "1"]]
+force = ["-x", "1", "-9.81"]
+[constraints]
+position = ["x - y"{}, {{ expr = "z - 0.1*x", contact = "touch" }}]
+[[latent]]
+kernel     = "se"
+features   = ["dx", "dz"]
+directions = "acceleration"
+)toml",
+                                    redundant),
+                        "carts");
+  };
+  const Model once = model_of(""), twice = model_of(", \"sin(x) - sin(y)\"");
+  RandomStream random(predictor_seed);
+  MatrixXd states(8, 12);  // x y z dx dy dz t touch
+  for (double& entry : states.reshaped()) entry = 2 * random.uniform() - 1;
+  states.row(1) = states.row(0);
+  states.row(4) = states.row(3);
+  for (Index i = 0; i < states.cols(); ++i) {
+    states(7, i) = static_cast<double>(i % 2);
+    if (i % 2 == 0) continue;
+    states(2, i) = 0.1 * states(0, i);
+    states(5, i) = 0.1 * states(3, i);
+  }
+  const auto learn = [&](const Model& model) {
+    const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt, false, Discrepancy{{}, VectorXd::Constant(3, 0.3)}});
+    RandomStream same(predictor_seed);
+    const std::vector<Observations> observations = {
+        test::observe(model, View::constrained_acceleration(*model.system), states, same)};
+    return Posterior(prior, observations, test::random_values(prior, observations, same));
+  };
+  const Posterior of_once = learn(once), of_twice = learn(twice);
+  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force}) {
+    const View view = View::all(quantity, *once.system);
+    const Predictor predictor(of_once, view), other(of_twice, view);
+    Predictor::Workspace workspace = predictor.make_workspace(), workspace_of_other = other.make_workspace();
+    double largest_stddev = 0;
+    for (const double error : {1e-6, 1e-5, 1e-4}) {
+      SCOPED_TRACE(fmt::format("{}, states off by {}, seed {}", quantity->word(), error, predictor_seed));
+      MatrixXd measured = states;
+      for (double& entry : measured.topRows(6).reshaped()) entry += error * (2 * random.uniform() - 1);
+      for (Index i = 0; i < measured.cols(); ++i) {
+        const VectorXd state = measured.col(i);
+        const Prediction expected(predictor, state, workspace), got(other, state, workspace_of_other);
+        ASSERT_EQ(expected.status, Status::ok);
+        ASSERT_EQ(got.status, Status::ok);
+        EXPECT_LE(largest(got.mean - expected.mean), 100 * error * (1 + largest(expected.mean)));
+        EXPECT_LE(largest(got.stddev - expected.stddev), 100 * error * (1 + largest(expected.stddev)));
+        EXPECT_LE(largest(of_twice.mean(view, state) - got.mean), 1e-9 * (1 + largest(got.mean)));
+        largest_stddev = std::max(largest_stddev, largest(got.stddev));
+      }
+    }
+    EXPECT_GT(largest_stddev, 0.1);
+  }
+}
+
 // Rows whose proportion changes with the state: multipliers of minimum norm have a derivative there too
 TEST(PredictorTest, DifferentiatesMultipliersOfRedundantRows) {
   const Model model = Model::parse(R"toml(

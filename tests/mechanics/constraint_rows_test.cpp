@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 
@@ -5,8 +6,10 @@
 #include <gtest/gtest.h>
 
 #include "gp2/mechanics/callable_system.hpp"
+#include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "mechanics/known_multipliers.hpp"
 #include "test_models.hpp"
 
 // A and b against the motion they come from.
@@ -97,6 +100,79 @@ TEST(ConstraintRowsTest, RedundantOnesStaySoAtMeasuredStates) {
       const VectorXd ddq = here.projections[i].Lb() + here.projections[i].T() * a_bar;
       const double rounding = 1e-10 * (1 + test::largest(ddq));
       EXPECT_LE(test::largest(beside.projections[i].constrain(a_bar) - ddq), rounding);
+    }
+  }
+}
+
+// Two carts side by side, one of which carries a mast that may touch.
+Model carts(const std::string& rows) {
+  return Model::parse(fmt::format(R"toml(
+name        = "carts"
+coordinates = ["x", "y", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "2", "0"], ["0", "0", "1"]]
+force = ["-x", "1", "-9.81"]
+[constraints]
+{}
+[[latent]]
+kernel     = "se"
+features   = ["dx"]
+directions = "acceleration"
+)toml",
+                                  rows),
+                      "carts");
+}
+
+// As above, where a row comes and goes.
+TEST(ConstraintRowsTest, RedundantOnesStaySoBesideConditionalOnes) {
+  const std::string contact = "{ expr = 'z - 0.1*x', contact = 'touch' }", when = "{ expr = 'z - 0.1*x', when = 'touch > 0.5' }",
+                    acceleration = "acceleration = [{ expr = 'ddz - 0.1*ddx', when = 'touch > 0.5' }]";
+  struct Rows {
+    std::string once, twice;
+  };
+  for (const auto& [once, twice] :
+       {Rows{"position = ['x - y', " + contact + "]", "position = ['x - y', " + contact + ", 'sin(x) - sin(y)']"},
+        Rows{"position = [" + when + ", 'x - y']", "position = [" + when + ", 'x - y', 'sin(x) - sin(y)']"},
+        Rows{"position = ['x - y']\n" + acceleration, "position = ['x - y', 'sin(x) - sin(y)']\n" + acceleration}}) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", twice, constraint_rows_seed));
+    const Model less = carts(once), more = carts(twice);
+    EXPECT_EQ(less.system->largest_rank(), 2);
+    EXPECT_EQ(more.system->largest_rank(), 2);
+    const VectorXd parameters = more.system->parameter_values();
+    RandomStream random(constraint_rows_seed);
+    MatrixXd exact(8, 20);  // x y z dx dy dz t touch
+    for (double& entry : exact.reshaped()) entry = 2 * random.uniform() - 1;
+    exact.row(1) = exact.row(0);
+    exact.row(4) = exact.row(3);
+    for (Eigen::Index i = 0; i < exact.cols(); ++i) {
+      exact(7, i) = static_cast<double>(i % 2);
+      if (i % 2 == 0) continue;
+      exact(2, i) = 0.1 * exact(0, i);
+      exact(5, i) = 0.1 * exact(3, i);
+    }
+    for (const double error : {1e-6, 1e-5, 1e-4}) {
+      SCOPED_TRACE(error);
+      MatrixXd measured = exact;
+      for (double& entry : measured.topRows(6).reshaped()) entry += error * (2 * random.uniform() - 1);
+      const MechanicsBatch expected = require_mechanics(*less.system, measured, parameters);
+      const MechanicsBatch got = require_mechanics(*more.system, measured, parameters);
+      const MatrixXd expected_lambda = with_known_multipliers(*less.system, measured, parameters).bottomRows(2);
+      const MatrixXd lambda = with_known_multipliers(*more.system, measured, parameters).bottomRows(3);
+      for (int i = 0; i < got.values.n_states(); ++i) {
+        const UdwadiaKalaba& of_less = expected.projections[static_cast<std::size_t>(i)];
+        const UdwadiaKalaba& of_more = got.projections[static_cast<std::size_t>(i)];
+        EXPECT_EQ(of_more.rank(), 1 + i % 2);
+        EXPECT_EQ(more.system->largest_rank_of(got.values.A(i)), 1 + i % 2);
+        // entries of A and b have slopes below 10, and the force is about 10
+        EXPECT_LE(test::largest(of_more.T() - of_less.T()), 10 * error);
+        EXPECT_LE(test::largest(of_more.Lb() - of_less.Lb()), 10 * error);
+        const VectorXd force = got.values.A(i).transpose() * lambda.col(i);
+        EXPECT_LE(test::largest(force - expected.values.A(i).transpose() * expected_lambda.col(i)), 100 * error);
+      }
+      const std::string text = "constraints: rank 2 of 3 rows: 1 redundant, which is allowed";
+      const std::vector<Finding> findings = check_system(*more.system, measured, parameters);
+      EXPECT_TRUE(std::ranges::any_of(findings, [&](const Finding& one) { return one.text == text; }));
     }
   }
 }
@@ -212,6 +288,9 @@ directions = "acceleration"
   EXPECT_EQ(largest_rank("position = ['x - t', 'x - 2*t']"), 2) << "they contradict each other";
   EXPECT_EQ(largest_rank("position = [" + loop + rod + "]\nvelocity = ['dx + dz']"), 4) << "not of positions alone";
   EXPECT_EQ(largest_rank("position = [" + loop + ", { expr = 'x^2 + z^2 - 0.49', when = 'x > 0' }]"), 3) << "not always there";
+  EXPECT_EQ(largest_rank("position = [" + loop + rod + ", { expr = 'a - 1', when = 'x > 0' }]"), 3);
+  EXPECT_EQ(largest_rank("position = [" + loop + rod + "]\nvelocity = [{ expr = 'da', when = 'x > 0' }]"), 3);
+  EXPECT_EQ(largest_rank("position = [" + loop + rod + "]\nvelocity = ['da', { expr = 'dx', when = 'x > 0' }]"), 5);
 }
 
 TEST(ConstraintRowsTest, AnAccelerationLevelConstraintIsTakenAsWritten) {

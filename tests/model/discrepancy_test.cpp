@@ -342,11 +342,22 @@ TEST(Discrepancy, FollowsTheParametersOfTheConstraintAndTheState) {
 TEST(Discrepancy, OfDeviationsThatHaveNoSquaresIsAnError) {
   const Eigen::RowVector2d A(1, 1);
   const auto of = [&](const Eigen::Vector2d& stddev) {
-    return MatrixXd(AdmissibleDirections(static_cast<int>(A.rows())).compute(A, MatrixXd(stddev.asDiagonal())));
+    return MatrixXd(AdmissibleDirections().compute(A, MatrixXd(stddev.asDiagonal())));
   };
   EXPECT_TRUE(of({1e-100, 1e-99}).allFinite());
   EXPECT_TRUE(of({1e100, 1e99}).allFinite());
   for (const double size : {1e170, 1e300}) EXPECT_THROW(of({size, size}), NumericalError);
+}
+
+TEST(Discrepancy, GoesWhereRowsOfTheLargestRankLetIt) {
+  const Eigen::RowVector3d row(1, -1, 0);
+  MatrixXd A(3, 3);
+  A << row, 1 + 1e-6, -1, 0, 0, 0, 0;
+  const MatrixXd B = Eigen::Vector3d(0.3, 2, 1).asDiagonal();
+  const MatrixXd expected = AdmissibleDirections().compute(row, B);
+  EXPECT_GT(test::largest(expected.leftCols(2)), 0.1);
+  EXPECT_LE(test::largest(AdmissibleDirections().compute(A, B, 1) - expected), 1e-5);
+  EXPECT_LE(test::largest(AdmissibleDirections().compute(A, B).leftCols(2)), 1e-9) << "independent ones";
 }
 
 TEST(Discrepancy, HasAUsableDeviationInEveryModel) {

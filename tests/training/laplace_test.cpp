@@ -405,6 +405,19 @@ TEST(LaplaceTest, NotesTellOfPriorsThatTheDataContradict) {
   EXPECT_EQ(uncertainty_notes(report_of_one(of_logarithm, 10.67)).size(), 1U);
 }
 
+// x of Laplace's approximation is the logarithm of what is positive by nature; people read the unit of the log.
+TEST(LaplaceTest, TheErrorOfANoiseIsInItsUnit) {
+  FitReport report;
+  Hyperparameter& noise = report.hyperparameters.emplace_back(Hyperparameter::of(Kind::noise_stddev, 0, 0));
+  noise.lower = 1e-3;
+  noise.upper = 1e3;
+  report.uncertainty.emplace().stddev = VectorXd::Constant(1, 0.05);
+  for (const double value : {0.01, 10.0}) {
+    noise.value = value;
+    EXPECT_DOUBLE_EQ(parameter_uncertainty(report, 0).stddev, 0.05 * value);
+  }
+}
+
 TEST(LaplaceTest, NotesSayWhichParametersStandardErrorsHoldAtABound) {
   FitReport report = report_of_one({}, 15);
   EXPECT_TRUE(uncertainty_notes(report).empty()) << "no other has an error";

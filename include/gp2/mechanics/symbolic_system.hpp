@@ -86,7 +86,7 @@ class SymbolicSystem final : public System {
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
   [[nodiscard]] bool depends_on_parameter(int index) const override { return values_.uses_input(layout().size() + index); }
-  /// Found at states where the constraints hold, if all are of positions and hold always.
+  /// Found at states where the constraints that hold always hold, if these are all of positions.
   [[nodiscard]] int largest_rank() const override { return largest_rank_; }
 
   [[nodiscard]] const Definition& definition() const { return definition_; }

@@ -51,7 +51,7 @@ class UdwadiaKalaba {
   }
 
   /// The same at another state. Allocates nothing where the sizes are those of the call before.
-  /// @param largest_rank  System::largest_rank: further directions of range(Bᵀ) count as redundant, and rows that have any may
+  /// @param largest_rank  System::largest_rank_of(A): further directions of range(Bᵀ) count as redundant, and rows that have any may
   ///                      differ from b by the error of the state
   void compute(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A,
                const Eigen::Ref<const Eigen::VectorXd>& b, int largest_rank = std::numeric_limits<int>::max());
