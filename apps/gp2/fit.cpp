@@ -210,17 +210,20 @@ void read_data(FitArguments& arguments, const Workers& workers) {
   require_use_of_commands(request);
 }
 
-// The rows of a raw log, which learning and smoothing by turns finds.
-void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
+// The fit to a raw log, which learning and smoothing by turns prepares.
+FitJob read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
   const FitRequest& request = arguments.request;
-  const LearnedLog log = learn_and_smooth(request, CsvTable::read(arguments.raw), arguments.raw_options, stop);
+  LearnedLog log = learn_and_smooth(request, CsvTable::read(arguments.raw), arguments.raw_options, stop);
   print_notes(log.data.notes);
   print_smoothing(log.data, *request.model.system);
   print_notes(log.notes);
   if (!arguments.smoothed.empty()) {
     as_table(log.data, *request.model.system, arguments.smoothed).write(arguments.smoothed);
+    // what went into a pipe cannot be read again
+    if (arguments.smoothed != "/dev/stdout" && std::filesystem::is_regular_file(arguments.smoothed))
+      log.files.push_back(*CsvTable::read(arguments.smoothed, CsvTable::Keep::numbers).file());
   }
-  arguments.request = log.request(std::move(arguments.request), arguments.raw);
+  return prepare_raw_fit(log, std::move(arguments.request), arguments.raw);
 }
 
 FitJob prepare(FitArguments& arguments, const std::shared_ptr<const Ranks>& ranks, const Interruption& interruption) {
@@ -228,7 +231,7 @@ FitJob prepare(FitArguments& arguments, const std::shared_ptr<const Ranks>& rank
   if (arguments.again.empty()) {
     arguments.request.model = Model::read(arguments.model);
     read_data(arguments, readers);
-    if (!arguments.raw.empty()) read_raw(arguments, interruption.stop());
+    if (!arguments.raw.empty()) return read_raw(arguments, interruption.stop());
     return prepare_fit(std::move(arguments.request));
   }
   const FitFile fit = FitFile::read(arguments.again);

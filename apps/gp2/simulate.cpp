@@ -104,6 +104,13 @@ const char* word_of(ContactEvent::Kind kind) {
   return kind == ContactEvent::Kind::impact ? "impact" : kind == ContactEvent::Kind::made ? "made" : "released";
 }
 
+// Distinguishes the moments of a motion however far from 0 its times are.
+std::string moment_text(const Trajectory& motion, double t) {
+  const double range = motion.times[motion.times.size() - 1] - motion.times[0];
+  const double beyond = range > 0 ? std::ceil(std::log10(std::max(1.0, std::abs(t) / range))) : 0;
+  return fmt::format("{:.{}g}", t, static_cast<int>(std::min(17.0, 6 + beyond)));
+}
+
 // "contacts: 12 rebounds, made 1 and released 0 times, the first at t = 0.45; the impacts took 3.2 J"
 std::optional<std::string> contacts_note(const Trajectory& motion, const System& system) {
   if (motion.events.empty()) return std::nullopt;
@@ -119,25 +126,22 @@ std::optional<std::string> contacts_note(const Trajectory& motion, const System&
   const bool moves = system.reads(SystemPart::residuals)[static_cast<std::size_t>(system.layout().t())];
   const std::string gain =
       least->energy_loss < -rounding * (1 + std::abs(loss))
-          ? fmt::format("; the one at t = {:.6g} gave {:.3g} J, as {}", least->time, -least->energy_loss,
+          ? fmt::format("; the one at t = {} gave {:.3g} J, as {}", moment_text(motion, least->time), -least->energy_loss,
                         moves ? "a surface that moves does, or Newton's restitution where friction turns the slip"
                               : "Newton's restitution does where friction turns the slip: a smaller restitution gives none")
           : "";
   return fmt::format(
-      "contacts: {} rebounds, made {} and released {} times, the first event at t = {:.6g}, the last, {}, at {:.6g}; "
+      "contacts: {} rebounds, made {} and released {} times, the first event at t = {}, the last, {}, at {}; "
       "impacts took {:.6g} J{}",
       count(ContactEvent::Kind::impact), count(ContactEvent::Kind::made), count(ContactEvent::Kind::released),
-      motion.events.front().time, word_of(last.kind), last.time, loss, gain);
+      moment_text(motion, motion.events.front().time), word_of(last.kind), moment_text(motion, last.time), loss, gain);
 }
 
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
 
-// the worst of several motions, their sums where that says more
-nlohmann::ordered_json report_of(const std::vector<SimulatedMotion>& motions, const System& system, const SimulateJob& job) {
+// The worst of several motions, their sums where that says more.
+Trajectory total_of(const std::vector<SimulatedMotion>& motions) {
   Trajectory total;
-  double energy_drift = 0;
-  std::size_t n_lower_rank = 0;
-  std::optional<double> leaves_data;
   for (const SimulatedMotion& motion : motions) {
     const Trajectory& one = motion.trajectory;
     total.max_position_drift = std::max(total.max_position_drift, one.max_position_drift);
@@ -146,10 +150,17 @@ nlohmann::ordered_json report_of(const std::vector<SimulatedMotion>& motions, co
     total.rejected_steps += one.rejected_steps;
     total.evaluations += one.evaluations;
     total.seconds += one.seconds;
-    n_lower_rank += one.lower_rank.states.size();
+  }
+  return total;
+}
+
+nlohmann::ordered_json report_of(const std::vector<SimulatedMotion>& motions, const System& system, const SimulateJob& job) {
+  const Trajectory total = total_of(motions);
+  double energy_drift = 0;
+  std::size_t n_lower_rank = 0;
+  for (const SimulatedMotion& motion : motions) {
+    n_lower_rank += motion.trajectory.lower_rank.states.size();
     if (motion.energy) energy_drift = std::max(energy_drift, largest_change(motion.energy->values));
-    const std::optional<double> left = motion.uncertainty ? motion.uncertainty->leaves_data : std::nullopt;
-    if (left && (!leaves_data || *left < *leaves_data)) leaves_data = left;
   }
   nlohmann::ordered_json report;
   report["max_position_drift"] = total.max_position_drift;
@@ -184,7 +195,8 @@ nlohmann::ordered_json report_of(const std::vector<SimulatedMotion>& motions, co
   for (std::size_t k = 0; k < changes.size(); ++k) {
     report["multiplier_sign_changes"][View::multipliers(system).names(system)[k]] = changes[k];
   }
-  report["leaves_data_at"] = leaves_data ? nlohmann::ordered_json(*leaves_data) : nullptr;
+  const SimulatedMotion* const leaving = first_to_leave(motions);
+  report["leaves_data_at"] = leaving ? nlohmann::ordered_json(*leaving->uncertainty->leaves_data) : nullptr;
   return report;
 }
 
@@ -207,12 +219,11 @@ std::vector<std::string> notes_of(const std::vector<SimulatedMotion>& motions, c
                                 first.start_position_residual, first.start_velocity_residual));
   }
   for (std::string& note : motion_notes(motions)) notes.push_back(std::move(note));
-  const nlohmann::ordered_json report = report_of(motions, system, job);
+  const Trajectory total = total_of(motions);
   Eigen::Index n_rows = 0;
   for (const SimulatedMotion& motion : motions) n_rows += motion.trajectory.times.size();
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
-                              report["steps"].get<int>(), report["max_position_drift"].get<double>(),
-                              report["max_velocity_drift"].get<double>()));
+                              total.steps, total.max_position_drift, total.max_velocity_drift));
   if (const std::optional<std::string> note = contacts_note(first, system)) notes.push_back(*note);
   if (motions[0].energy) {
     const Eigen::VectorXd& energy = motions[0].energy->values;

@@ -188,8 +188,9 @@ py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwar
   report["notes"] = with_keywords(std::move(notes));
   report["gains"] = log.gains;
   CsvTable smoothed = as_table(log.data, system.system(), "smoothed data");
-  request = log.request(std::move(request), "raw data");
-  return py::make_tuple(run(prepared(std::move(request)), progress), std::move(smoothed), std::move(report));
+  const FitJob job =
+      before_any("posterior", [&] { return unlocked([&] { return prepare_raw_fit(log, std::move(request), "raw data"); }); });
+  return py::make_tuple(run(job, progress), std::move(smoothed), std::move(report));
 }
 
 PyPosterior fit_again(const py::object& path, const py::object& data, const py::object& commands, const py::object& also,

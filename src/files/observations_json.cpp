@@ -110,19 +110,23 @@ Observations observations_from(const ParsedJson& json, const Prior& fitted, std:
 
 Json logs_json(const std::vector<LogFile>& logs) {
   Json json = Json::array();
-  for (const LogFile& log : logs)
+  for (const LogFile& log : logs) {
     json.push_back({{"name", log.name}, {"bytes", log.bytes}, {"rows", log.rows}, {"checksum", log.checksum}});
+    if (log.n_learned) json.back()["learned"] = *log.n_learned;
+  }
   return json;
 }
 
 std::vector<LogFile> logs_from(const ParsedJson& json) {
   std::vector<LogFile> logs;
   for (const ParsedJson& log : array(json)) {
-    for (const char* key : {"bytes", "rows"}) {
+    for (const char* key : {"bytes", "rows", "learned"}) {
+      if (key == std::string_view("learned") && !log.contains(key)) continue;  // a fit without later rows, or of an older version
       if (!log.at(key).is_number_unsigned())
         throw InputError(fmt::format("{} stands where a whole number must", shown(log.at(key))));
     }
     logs.push_back({log.at("name"), log.at("bytes"), log.at("rows"), log.at("checksum")});
+    if (log.contains("learned")) logs.back().n_learned = log.at("learned").get<std::int64_t>();
   }
   return logs;
 }

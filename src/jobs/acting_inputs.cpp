@@ -55,7 +55,7 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
     if (step > lateness && out.record->usual_change() * lateness > little * step) {
       notes.push_back(
           fmt::format("warning: {}: rows are usually {:.3g} s apart, inputs at most {:.3g} s late: what acts in between is not "
-                      "known; log faster, or, if these are rows of a longer log, give that as `commands`",
+                      "known; log faster, or, if these are rows of a longer log, give all of it, to a fit as `commands`",
                       reader.table().name(), out.record->usual_step(), lateness));
     }
   }

@@ -15,6 +15,10 @@ using Eigen::VectorXd;
 ActingStates::ActingStates(const Prior& prior) {
   for (const Latent& latent : prior.latents) {
     names_.push_back(latent.name);
+    directions_.push_back(latent.direction);
+    are_of_coordinates_.push_back(std::ranges::any_of(prior.system->coordinates(), [&](const Coordinate& one) {
+      return latent.direction == one.acceleration() || latent.direction == "force_" + one.name;
+    }));
     acts_.push_back(!latent.directions);
   }
   moves_ = acts_;
@@ -47,17 +51,22 @@ void ActingStates::count(const Prior& prior, const MatrixXd& states, const Vecto
 std::vector<std::string> ActingStates::idle_texts(bool accelerations) const {
   std::vector<std::string> warnings;
   for (std::size_t a = 0; a < acts_.size() && n_states_ > 0; ++a) {
-    if (acts_[a] && !moves_[a] && accelerations) {
+    const std::string direction = directions_[a].empty() ? "" : fmt::format(", {},", directions_[a]);
+    // a constraint takes up the directions of some coordinates wherever it holds them
+    bool is_needless = false;
+    for (std::size_t k = 0; k < names_.size() && are_of_coordinates_[a]; ++k)
+      is_needless = is_needless || (moves_[k] && names_[k] == names_[a]);
+    if (acts_[a] && !moves_[a] && accelerations && !is_needless) {
       warnings.push_back(
-          fmt::format("latent '{}' acts along the constraints, which take it up, at all of {} states: accelerations "
+          fmt::format("latent '{}'{} acts along the constraints, which take it up, at all of {} states: accelerations "
                       "tell nothing of it; check the signs of its directions",
-                      names_[a], n_states_));
+                      names_[a], direction, n_states_));
     }
     if (acts_[a]) continue;
-    warnings.push_back(
-        fmt::format("latent '{}' acts at 0 of {} states: its direction is 0, and nothing is learned of it; check the sign of its "
-                    "load, or the condition under which it acts",
-                    names_[a], n_states_));
+    warnings.push_back(fmt::format(
+        "latent '{}'{} acts at 0 of {} states: its direction is 0, and nothing is learned of it; check the sign of its "
+        "load, or the condition under which it acts",
+        names_[a], direction, n_states_));
   }
   return warnings;
 }

@@ -82,7 +82,12 @@ void check_columns_of(const CsvTable& table, const LogReader& reader, const Whol
   const std::vector<std::string> accelerations = system.acceleration_names();
   const auto good = [&](std::string text) { findings.push_back({Level::good, std::move(text)}); };
   good(fmt::format("{}: {} rows; all columns that the model reads were found", table.name(), table.n_rows()));
-  if (!log.missing.empty()) {
+  if (std::ssize(log.missing) == system.nq()) {
+    findings.push_back(
+        {Level::warning,
+         fmt::format("not in the log: {}; a fit needs at least one of them; gp2 derive computes them from positions over t",
+                     fmt::join(log.missing, ", "))});
+  } else if (!log.missing.empty()) {
     findings.push_back(
         {Level::warning, fmt::format("not in the log: {}; fit with `observe` for the others", fmt::join(log.missing, ", "))});
   }
@@ -419,11 +424,7 @@ void check_turns(const WholeLog& log, const System& system, int j, std::vector<F
 void check_values(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
   const StateLayout layout = system.layout();
   const auto add = [&](Level level, const std::string& name, const Eigen::RowVectorXd& values, const char* meaning) {
-    if (const std::optional<PileUp> found = pile_up(values)) {
-      findings.push_back(
-          {level, fmt::format("{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: {}", name,
-                              found->value, 100 * found->share, meaning)});
-    }
+    if (auto text = pile_up_text(name, values, meaning)) findings.push_back({level, *std::move(text)});
   };
   for (int k = 0; k < layout.nu; ++k) {
     const std::string& name = system.inputs()[static_cast<std::size_t>(k)];
@@ -459,7 +460,10 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
   double unit_of_time = 1;
   for (std::string& text : wrong_rates(system, log.states, log.accelerations, log.reads_time, &unit_of_time))
     findings.push_back({Level::warning, std::move(text)});
-  if (unit_of_time != 1) {
+  const std::vector<bool> all_read(static_cast<std::size_t>(system.layout().size()), true);
+  if (std::optional<std::string> text = text_of_late_inputs(system, all_read, model.actuators, unit_of_time)) {
+    findings.push_back({Level::warning, *std::move(text)});
+  } else if (unit_of_time != 1) {
     findings.push_back(
         {Level::warning,
          fmt::format("the rates of the coordinates say that t counts {:g} s, not seconds: a fit does not mind, but "

@@ -190,10 +190,14 @@ class Deriver {
   void lay_out_rows() {
     std::vector<double> times;
     for (int e = 0; e < std::ssize(episodes_); ++e) {
-      rows_.push_back({static_cast<Index>(times.size()), times_to_write(episode_of(e))});
+      const Episode& episode = episode_of(e);
+      rows_.push_back({static_cast<Index>(times.size()), times_to_write(episode)});
       for (const double since : rows_.back().times) {
-        times.push_back(episode_of(e).start + since);
+        times.push_back(episode.start + since);
         data_.episode.push_back(e);
+      }
+      for (std::size_t k = 0; k < episode.rows.size() && options_.rate == 0; ++k) {
+        if (k == 0 || episode.times[k] > episode.times[k - 1]) data_.lines.push_back(log_.line(episode.rows[k]));
       }
     }
     const auto n = static_cast<Index>(times.size());
@@ -215,9 +219,10 @@ class Deriver {
       for (const Episode& episode : episodes_) {
         double before = not_a_number;
         for (std::size_t k = 0; k < episode.rows.size(); ++k) {
-          if (episode.times[k] == before) continue;
+          if (episode.times[k] != before) cells.emplace_back();
           before = episode.times[k];
-          cells.push_back(log_.cell(episode.rows[k], column));
+          // sensors may write rows of their own
+          if (is_missing(cells.back())) cells.back() = log_.cell(episode.rows[k], column);
         }
       }
     }
@@ -240,6 +245,7 @@ class Deriver {
       values.resize(rows.size());
     };
     thin(data_.episode);
+    if (!data_.lines.empty()) thin(data_.lines);
     for (auto& cells : data_.kept) thin(cells);
   }
 
@@ -312,7 +318,7 @@ CsvTable as_table(const DerivedData& data, const System& system, std::string nam
     if (!values.array().isNaN().any()) add(column, values);
   };
   if (!data.episode_column.empty()) {
-    std::vector<std::string>& labels = columns.emplace_back(CsvTable::Column{data.episode_column, {}}).cells;
+    std::vector<std::string>& labels = columns.emplace_back(CsvTable::Column{"episode", {}}).cells;
     for (const int episode : data.episode) labels.push_back(data.episodes[static_cast<std::size_t>(episode)]);
   }
   add("t", data.states.row(layout.t()));

@@ -5,6 +5,7 @@
 
 #include <fmt/format.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/simulate.hpp"
@@ -59,12 +60,6 @@ Hole longest_hole(const Channel& channel, const Episode& episode) {
   return !steps.empty() && longest.length <= many * median(steps) ? Hole{} : longest;
 }
 
-/// Of the log, below its header: the first with a time.
-int line_of(const Episode& episode, double time) {
-  const auto at = std::lower_bound(episode.times.begin(), episode.times.end(), time);
-  return episode.rows[static_cast<std::size_t>(at - episode.times.begin())] + 2;
-}
-
 /// The series of the least bandwidth in an episode, of the coordinates that an input drives; of all where it drives none of them.
 const DerivedSeries& slowest_of(const std::vector<DerivedSeries>& all, int episode, const std::vector<bool>& driven) {
   const DerivedSeries *slowest = nullptr, *slowest_driven = nullptr;
@@ -84,16 +79,19 @@ void add_inputs(const System& system, const RawLog& raw, const std::string& log,
   for (std::size_t u = 0; u < system.inputs().size(); ++u) {
     if (!raw.has_input(u)) continue;
     const std::vector<bool> driven = driven_by(system, u);
-    std::vector<double> as_logged;
-    std::vector<int> lines;
+    std::vector<double> as_logged;  // by the rows of the log; NaN: no value
     Hole longest;
     for (std::size_t e = 0; e < rows.size(); ++e) {
       const Episode& episode = raw.episodes()[e];
       const DerivedSeries& slowest = slowest_of(data.series, static_cast<int>(e), driven);
       const Channel channel = raw.input(u, episode);
-      for (const Measurement& one : channel.measurements) {
-        as_logged.push_back(one.value + channel.mean);
-        lines.push_back(line_of(episode, one.time));
+      Episode by_row = episode;  // with numbers of rows for times, which several rows may share
+      by_row.times.assign(episode.rows.begin(), episode.rows.end());
+      const Channel written = raw.input(u, by_row);
+      for (const Measurement& one : written.measurements) {
+        const auto row = static_cast<std::size_t>(one.time);
+        as_logged.resize(std::max(as_logged.size(), row + 1), not_a_number);
+        as_logged[row] = one.value + written.mean;
       }
       if (const Hole hole = longest_hole(channel, episode); hole.length > longest.length && hole.length * slowest.bandwidth > 1)
         longest = hole;
@@ -105,7 +103,7 @@ void add_inputs(const System& system, const RawLog& raw, const std::string& log,
     const Eigen::Map<const Eigen::RowVectorXd> commands(as_logged.data(), std::ssize(as_logged));
     const std::string& name = system.inputs()[u];
     if (auto text = clipped_input(name, commands)) data.notes.push_back(*std::move(text));
-    if (auto text = far_values_text(name, {commands}, {lines})) data.notes.push_back(fmt::format("warning: {}: {}", log, *text));
+    if (auto text = far_values_text(name, {commands})) data.notes.push_back(fmt::format("warning: {}: {}", log, *text));
     if (longest.length > 0) {
       data.notes.push_back(
           fmt::format("warning: {}: the input {} has no value for {:.3g} s, from t = {:.6g} on: what is written there is a guess",

@@ -506,8 +506,8 @@ void note_unexplained(const std::vector<std::string>& inputs, double gain, std::
 }
 
 // A wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be.
-void note_doubts(const Doubted& doubted, std::vector<Observations> observations, std::vector<InputEffect> inputs, bool asks_logs,
-                 std::vector<std::string>& notes) {
+Doubts note_doubts(const Doubted& doubted, std::vector<Observations> observations, std::vector<InputEffect> inputs,
+                   bool asks_logs, std::vector<std::string>& notes) {
   const Cost cost = cost_under(doubted.posterior.prior(), doubted.posterior.values());
   constexpr double several = 10;  // times what stays unexplained
   struct Claim {
@@ -566,6 +566,7 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
       break;
     }
   }
+  Doubts noted;
   // what is wrong elsewhere may be all that speaks for a claim
   for (const Claim& claim : claims) {
     if (claim.gain < least_claim) {
@@ -581,14 +582,17 @@ void note_doubts(const Doubted& doubted, std::vector<Observations> observations,
         fmt::format("warning: the data contradict the {}: they are most likely if {}, by {:.2g} in log likelihood. {}",
                     (claim.explanation.input == known_force ? "" : "input ") + claim.name, claim.explanation.text,
                     claim.explanation.gain, claim.explanation.cause + instead));
+    if (claim.explanation.kind == Hypothesis::Kind::late) noted.delays.push_back(notes.back());
   }
   note_unexplained(unexplained, unexplained_gain, notes);
+  if (!unexplained.empty()) noted.unexplained = notes.back();
+  return noted;
 }
 
 }  // namespace
 
-void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, const std::vector<std::string>& held,
-                const FittedValues& fitted_values, bool has_wrong_rate, std::vector<std::string>& notes) {
+Doubts add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>& lines, const std::vector<std::string>& held,
+                  const FittedValues& fitted_values, bool has_wrong_rate, std::vector<std::string>& notes) {
   constexpr int enough = 1000, fewest = 10;  // values: a sign or a unit needs no more; states
   constexpr std::size_t most_logs = 10;      // each of which is asked by itself
   const Prior& prior = posterior.prior();
@@ -596,7 +600,8 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   const StateLayout layout = system.layout();
   const std::vector<Observations>& all = posterior.observations();
   const auto any = [&](const auto& is) { return std::any_of(all.begin(), all.end(), is); };
-  if (prior.reference || n_states(all) < fewest || any([](const auto& group) { return bool(group.view().other_system); })) return;
+  if (prior.reference || n_states(all) < fewest || any([](const auto& group) { return bool(group.view().other_system); }))
+    return {};
   const bool of_windows = has_sums(all);
   const bool asks = !has_wrong_rate && (!of_windows || (!prior.is_nonlinear() && n_states(all) * system.nq() <= 2 * enough));
   const bool asks_logs = asks && !of_windows && all.size() > 1 && all.size() <= most_logs;
@@ -634,7 +639,7 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
     }
   }
   // they make all else look wrong
-  if (has_far_values) return;
+  if (has_far_values) return {};
   const std::size_t n_inputs = inputs.size();
   for (std::size_t k = 0; k < n_inputs && asks_logs; ++k) {
     for (std::size_t g = 0; g < all.size(); ++g) {
@@ -646,7 +651,7 @@ void add_doubts(const Posterior& posterior, const std::vector<std::vector<int>>&
   }
   std::vector<Observations> observations = some;
   if (asks_logs) note_lost_inputs(posterior, observations, fitted_values, notes);
-  note_doubts(doubted, std::move(observations), std::move(inputs), asks_logs, notes);
+  return note_doubts(doubted, std::move(observations), std::move(inputs), asks_logs, notes);
 }
 
 }  // namespace gp2

@@ -69,13 +69,16 @@ void require_order(const std::string& option, const std::string& name, const std
   throw InputError(fmt::format("{}: {} = {}:{} must be finite, the lower limit first", option, name, lower, upper));
 }
 
-std::vector<Limit> input_limits(const System& system, const Limits& given) {
-  const std::vector<std::string>& inputs = system.inputs();
+std::vector<Limit> input_limits(const Model& model, const Limits& given) {
+  const System& system = *model.system;
+  const std::vector<std::string> inputs = driving_inputs(model);
   if (inputs.empty()) {
     throw InputError(fmt::format("excite: '{}' has no inputs to drive it", system.name()));
   }
   for (const auto& [name, range] : given) {
     if (std::find(inputs.begin(), inputs.end(), name) == inputs.end()) {
+      if (std::ranges::count(system.inputs(), name) > 0)
+        throw InputError(fmt::format("`inputs_within`: '{}' is a contact, which the motion makes: leave it out", name));
       throw InputError(
           fmt::format("`inputs_within`: '{}' is no input of '{}'; there are: {}", name, system.name(), fmt::join(inputs, ", ")));
     }
@@ -84,11 +87,12 @@ std::vector<Limit> input_limits(const System& system, const Limits& given) {
   std::vector<Limit> limits;
   for (const std::string& name : inputs) {
     const auto found = given.find(name);
+    const Index input = std::ranges::find(system.inputs(), name) - system.inputs().begin();
     if (found == given.end()) {
       throw InputError(
           fmt::format("`inputs_within`: no limits of '{}'; give its lowest and highest value, 0:0 to leave it out", name));
     }
-    limits.push_back({name, found->second.first, found->second.second, system.layout().t() + 1 + std::ssize(limits)});
+    limits.push_back({name, found->second.first, found->second.second, system.layout().u(0) + input});
   }
   if (std::all_of(limits.begin(), limits.end(), [](const Limit& one) { return one.half_width() == 0; })) {
     throw InputError("`inputs_within`: all inputs are fixed by their limits");
@@ -128,11 +132,12 @@ void require_start_within(const VectorXd& start, const std::vector<Limit>& limit
 
 // ---------------------------------------------------------------- motions
 
-/// Inputs middle + half width tanh(s) at fixed times, s the Fourier series of given coefficients.
+/// Inputs middle + half width tanh(s) at fixed times, s the Fourier series of given coefficients; 0 those without limits.
 class InputFamily {
  public:
-  InputFamily(std::vector<Limit> limits, VectorXd times, int n_harmonics, std::vector<Actuator> actuators)
+  InputFamily(std::vector<Limit> limits, StateLayout layout, VectorXd times, int n_harmonics, std::vector<Actuator> actuators)
       : limits_(std::move(limits)),
+        layout_(layout),
         times_(std::move(times)),
         actuators_(std::move(actuators)),
         basis_(1 + 2 * n_harmonics, times_.size()) {
@@ -154,10 +159,10 @@ class InputFamily {
 
   /// (nu × times)
   [[nodiscard]] MatrixXd commands(const VectorXd& coefficients) const {
-    MatrixXd values(std::ssize(limits_), times_.size());
+    MatrixXd values = MatrixXd::Zero(layout_.nu, times_.size());
     Index first = 0;
-    for (Index j = 0; j < values.rows(); ++j) {
-      const Limit& limit = limits_[static_cast<std::size_t>(j)];
+    for (const Limit& limit : limits_) {
+      const Index j = limit.row - layout_.u(0);
       values.row(j).setConstant(limit.middle());
       if (limit.half_width() == 0) continue;
       const auto s = (coefficients.segment(first, basis_.rows()).transpose() * basis_).array();
@@ -171,6 +176,7 @@ class InputFamily {
 
  private:
   std::vector<Limit> limits_;
+  StateLayout layout_;
   VectorXd times_;
   std::vector<Actuator> actuators_;
   MatrixXd basis_;
@@ -469,7 +475,7 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
   if (observed_rows(posterior).empty()) {
     throw InputError("excite: the fit observed no accelerations, so their noise is unknown");
   }
-  const std::vector<Limit> inputs = input_limits(system, request.inputs_within), limits = state_limits(system, request.within);
+  const std::vector<Limit> inputs = input_limits(model, request.inputs_within), limits = state_limits(system, request.within);
 
   const lapack::SingleThread single_thread;
   const ExpectedInformation information(posterior.prior(), posterior.observations(), hyperparameters, driven.other_system,
@@ -496,8 +502,9 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
     out.notes.emplace_back("delays and lags count as known: what their errors add to those of parameters is left out");
   }
 
-  Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics, driven.actuators),
-                limits, out.target, request, stop);
+  Search search(std::move(motion), information,
+                InputFamily(inputs, system.layout(), of_motion.times, request.n_harmonics, driven.actuators), limits, out.target,
+                request, stop);
   search.run(progress);
   require_within(search.best(), limits, search.n_motions());
 

@@ -183,6 +183,15 @@ void note_load_without_force(const FitProblem& problem, std::vector<std::string>
                   latent->name, latent->reads_multipliers() ? "lambda" : "lambda0"));
 }
 
+// Start values that were given for other rows, within the bounds that these give.
+void clamp_start(FitRequest& request, const std::vector<Hyperparameter>& hyperparameters) {
+  for (const Hyperparameter& h : hyperparameters) {
+    const auto start = request.start.values.find(h.name);
+    if (start == request.start.values.end() || request.max_iterations == 0) continue;
+    start->second = std::clamp(start->second, h.lower, h.upper);
+  }
+}
+
 // What both kinds of preparation end with.
 FitJob job_of(FitRequest request, FitProblem problem) {
   // a file of starting values may change: the record has the values
@@ -198,8 +207,6 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   asked.n_inducing = settled_inducing(request, problem, asked);
   asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
-  job.has_wrong_rate = std::ranges::any_of(
-      job.notes, [](const std::string& note) { return note.find(" is not the rate of ") != std::string::npos; });
   note_load_without_force(problem, job.notes);
   job.thin = request.thin && !has_sums(problem.observations) && !problem.robust &&
              request.problem.protocol.name == Protocol::Name::standard;
@@ -245,10 +252,14 @@ TrustedData trusted_data(const Posterior& posterior, const FitReport& report, co
 struct Worth {
   std::vector<int> rows;  // of each Observations
   std::string text;       // which residuals say so
+  double left = 0;        // the largest correlation of residuals of the rows kept, where more are not left out
 
   // As many rows as it takes for correlated residuals to forget, but not so many that hardly any are left.
-  Worth(const std::vector<TrainingResidual>& residuals, const std::vector<Observations>& observations)
-      : rows(observations.size(), 1), text((last_beyond_noise(residuals) ? "warning: " : "") + correlated_text(residuals)) {
+  Worth(const std::vector<TrainingResidual>& residuals, const FitProblem& problem)
+      : rows(problem.observations.size(), 1),
+        text((last_beyond_noise(residuals) ? "warning: " : "") +
+             correlated_text(residuals, problem.prior_options.baseline.has_value())) {
+    const std::vector<Observations>& observations = problem.observations;
     constexpr double forgotten = 0.3;
     constexpr int fewest = 40;  // of all logs together
     int n_rows = 0;
@@ -259,7 +270,9 @@ struct Worth {
       const int most = std::max(1, std::min(n_rows / fewest, observations[one.group].n_data()));
       const double needed = std::ceil(std::log(forgotten) / std::log(std::min(one.serial_correlation, 0.999)));
       rows[one.group] = std::max(rows[one.group], std::min(most, static_cast<int>(needed)));
+      if (needed > most) left = std::max(left, std::pow(one.serial_correlation, most));
     }
+    if (left > 0 && !text.starts_with("warning: ")) text = "warning: " + text;
   }
   [[nodiscard]] bool is_less() const {
     return std::any_of(rows.begin(), rows.end(), [](int n) { return n > 1; });
@@ -312,6 +325,11 @@ class Tests {
   std::map<std::string, std::vector<std::string>> untested_;
 };
 
+// A fit, and which of its notes what fewer or more of the rows say may replace.
+struct FitRun : FitOutcome {
+  Doubts doubts = {};
+};
+
 // Estimated parameters that a bound or a prior holds rather than the data.
 std::vector<std::string> held_parameters(const FitReport& report) {
   constexpr double most = 0.7;  // of the deviation of a prior, where the data tell of the parameter
@@ -330,7 +348,7 @@ std::vector<std::string> held_parameters(const FitReport& report) {
 }
 
 // Scores of what is left out, and what residuals and data say of the fit.
-void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, FitOutcome& outcome) {
+void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, FitRun& outcome) {
   const Posterior& posterior = outcome.posterior;
   std::vector<std::string>& notes = outcome.notes;
   std::optional<CrossValidation>& scores = outcome.cross_validation;
@@ -342,7 +360,11 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   tests.run("the values left out", [&] { scores = cross_validate(posterior, trusted.observations, /*has_time_order=*/true); });
   if (scores && report.inducing) report.inducing->stretches = scores->stretches;
   if (report.iterations > 0) tests.run("the noise", [&] { add_noise_notes(posterior, notes); });
-  if (scores) tests.run("the residuals", [&] { add_residual_notes(posterior, trusted, scores->residuals, notes); });
+  const auto add_notes_of_residuals = [&] {
+    const bool is_paper = request_of(job.file).problem.protocol.name == Protocol::Name::paper;
+    add_residual_notes(posterior, trusted, scores->residuals, notes, is_paper);
+  };
+  if (scores) tests.run("the residuals", add_notes_of_residuals);
   tests.run("values at the ends of a range", [&] { add_pile_up_notes(trusted.observations, *posterior.prior().system, notes); });
   if (scores) tests.run("the stretches", [&] { add_stretch_note(*scores, notes, posterior.prior()); });
   FitOptions quick;
@@ -355,9 +377,11 @@ void add_tests(const FitJob& job, const FitOptions& options, FitReport& report, 
   const FittedValues fitted_values = [&](const std::vector<Observations>& some) {
     return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
   };
-  tests.run("the inputs and the logs",
-            [&] { add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, job.has_wrong_rate, notes); });
-  const std::string correlated = scores ? correlated_text(scores->residuals) : "";
+  tests.run("the inputs and the logs", [&] {
+    outcome.doubts =
+        add_doubts(posterior, trusted.lines, held_parameters(report), fitted_values, job.problem.has_wrong_rate, notes);
+  });
+  const std::string correlated = scores ? correlated_text(scores->residuals, job.problem.prior_options.baseline.has_value()) : "";
   if (!correlated.empty()) notes.push_back(fmt::format("warning: {}: standard deviations are too small", correlated));
   tests.add_notes(notes);
 }
@@ -376,7 +400,7 @@ void explain_restitution(const Model& model, std::vector<std::string>& notes) {
   }
 }
 
-FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+FitRun run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
   options.progress = progress;
   options.stop = stop;
@@ -393,7 +417,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     };
   }
   Fit result = fit_and_name_gross_errors(job.problem, options);
-  FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
+  FitRun outcome{{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt}};
   if (!unsaved.empty()) outcome.notes.push_back(fmt::format("warning: a checkpoint was not saved: {}", unsaved));
   for (std::string& note : notes_of(result.report, outcome.posterior)) outcome.notes.push_back(std::move(note));
   explain_restitution(job.file.model, outcome.notes);
@@ -450,6 +474,7 @@ FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
   FitRequest request = request_of(job.file);
   problem.hyperparameters = starting_hyperparameters(job.file.model, problem, request.problem);
   for (const auto& [name, value] : values) request.start.values.erase(name);
+  clamp_start(request, problem.hyperparameters);
   if (!request.start.empty()) read_start(request.start, request.max_iterations, job.file.model.actuators, problem);
   return job;
 }
@@ -462,9 +487,12 @@ FitFile with_states(FitFile file, const std::vector<Observations>& all, const St
   return file;
 }
 
+FitRun run_for_what_rows_are_worth(const FitJob& job, const std::function<void(const Progress&)>& progress,
+                                   const std::atomic<bool>* stop);
+
 // The fit to every k-th row.
-FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::function<void(const Progress&)>& progress,
-                       const std::atomic<bool>* stop) {
+FitRun run_thinned(const FitJob& job, const Worth& worth, const std::function<void(const Progress&)>& progress,
+                   const std::atomic<bool>* stop) {
   const std::vector<Observations>& all = job.problem.observations;
   int n_all = 0, n_taken = 0;
   std::vector<std::vector<int>> lines(all.size());
@@ -481,12 +509,20 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
   FitJob fewer = prepare_fit_again(file, job.options.n_threads);
   fewer.problem.lines = std::move(lines);
   fewer.actuators = job.actuators;
-  fewer.has_wrong_rate = job.has_wrong_rate;
+  fewer.problem.has_wrong_rate = job.problem.has_wrong_rate;
   fewer.options.ranks = job.options.ranks;
   fewer.checkpoint = job.checkpoint;
-  FitOutcome outcome = run_fit(fewer, progress, stop);
+  FitRun outcome = run_for_what_rows_are_worth(fewer, progress, stop);
+  std::string text;
+  if (worth.left > 0) {
+    text = fmt::format(
+        ". More are not left out, so that enough remain: their residuals are still correlated by {:.2g}, and standard deviations "
+        "are "
+        "too small by a factor of about {:.2g}",
+        worth.left, std::sqrt((1 + worth.left) / (1 - worth.left)));
+  }
   outcome.notes.push_back(
-      fmt::format("{}: fitted to {} of {}, evenly spaced (`thin=none` fits all)", worth.text, n_taken, n_all));
+      fmt::format("{}: fitted to {} of {}, evenly spaced (`thin=none` fits all){}", worth.text, n_taken, n_all, text));
   std::rotate(outcome.notes.begin(), outcome.notes.end() - 1, outcome.notes.end());
   return outcome;
 }
@@ -507,7 +543,7 @@ std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>
   quick.options.standard_errors = false;
   const FitOutcome outcome = run_once(quick, {}, stop);
   if (!outcome.cross_validation) return std::nullopt;
-  return Worth(outcome.cross_validation->residuals, all);
+  return Worth(outcome.cross_validation->residuals, job.problem);
 }
 
 // What all rows say takes the place of what fewer of them say of the same: notes that begin alike.
@@ -522,34 +558,40 @@ void take_notes_of_all(std::vector<std::string> of_all, std::vector<std::string>
   notes.insert(notes.begin(), std::make_move_iterator(of_all.begin()), std::make_move_iterator(of_all.end()));
 }
 
-FitOutcome run_for_what_rows_are_worth(const FitJob& job, const std::function<void(const Progress&)>& progress,
-                                       const std::atomic<bool>* stop) {
+// The fit to all rows, in place of one to fewer that was stopped.
+FitRun interrupted(FitRun all) {
+  all.file.report.termination = FitReport::interrupted;
+  all.file.report.converged = false;
+  return all;
+}
+
+FitRun run_for_what_rows_are_worth(const FitJob& job, const std::function<void(const Progress&)>& progress,
+                                   const std::atomic<bool>* stop) {
   if (!job.thin) return run_once(job, progress, stop);
-  std::optional<FitOutcome> all;
+  std::optional<FitRun> all;
   try {
     const std::optional<Worth> before = worth_of_stretch(job, stop);
     if (before && before->is_less()) return run_thinned(job, *before, progress, stop);
     if (!job.unaffordable.empty()) throw InputError(job.unaffordable);
     all = run_once(job, progress, stop);
     if (!all->cross_validation) return *all;
-    const Worth worth(all->cross_validation->residuals, job.problem.observations);
+    const Worth worth(all->cross_validation->residuals, job.problem);
     const TrustedData trusted = trusted_data(all->posterior, all->file.report, job.problem.lines);
     // that a constraint does not hold is no error that lasts
     if (!worth.is_less() || denies_constraints(all->posterior, trusted)) return *all;
-    FitOutcome fewer = run_thinned(job, worth, progress, stop);
-    if (fewer.file.report.termination == FitReport::interrupted) return *all;
+    FitRun fewer = run_thinned(job, worth, progress, stop);
+    if (fewer.file.report.termination == FitReport::interrupted) return interrupted(*std::move(all));
     std::vector<std::string> notes;
     add_residual_notes(all->posterior, trusted, all->cross_validation->residuals, notes);
     // rows that are left out tell of no delay that is shorter than what lies between the others
-    const auto tells_delay = [](const std::string& note) { return note.find("er than logged, by ") != std::string::npos; };
-    std::ranges::copy_if(all->notes, std::back_inserter(notes), tells_delay);
-    if (std::ranges::any_of(notes, tells_delay))
-      std::erase_if(fewer.notes,
-                    [](const std::string& note) { return note.find("does not explain what the input") != std::string::npos; });
+    const std::vector<std::string>& delays = all->doubts.delays;
+    notes.insert(notes.end(), delays.begin(), delays.end());
+    if (!delays.empty()) std::erase(fewer.notes, fewer.doubts.unexplained);
     take_notes_of_all(std::move(notes), fewer.notes);
     return fewer;
   } catch (const Error& error) {
     if (!job.unaffordable.empty()) throw;
+    if (all && is_set(stop)) return interrupted(*std::move(all));
     if (!all) all = run_once(job, progress, stop);
     if (!is_set(stop))
       all->notes.push_back(fmt::format("fitted to all rows, because the fit to fewer rows failed: {}", error.what()));
@@ -727,6 +769,7 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   }
   problem.lines.resize(problem.observations.size());
   problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
+  clamp_start(request, problem.hyperparameters);
   FitJob job = job_of(std::move(request), std::move(problem));
   job.file.logs = fit.logs;
   job.file.notes = fit.notes;

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <map>
 #include <optional>
+#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -65,12 +66,9 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
     }
     const std::vector<std::string> names = view.names(system);
     for (int k = 0; k < view.size(); ++k) {
-      if (const std::optional<PileUp> found = pile_up(group.values().row(k))) {
-        notes.push_back(
-            fmt::format("warning: {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: a "
-                        "sensor at the end of its range?",
-                        names[static_cast<std::size_t>(k)], of_log, found->value, 100 * found->share));
-      }
+      const std::string name = fmt::format("warning: {}{}", names[static_cast<std::size_t>(k)], of_log);
+      if (auto text = pile_up_text(name, group.values().row(k), "a sensor at the end of its range?"))
+        notes.push_back(*std::move(text));
     }
   }
 }
@@ -132,19 +130,22 @@ std::vector<ConstraintResidual> residuals_against_constraints(const Posterior& p
 void add_constraint_residual_notes(const Posterior& posterior, const TrustedData& trusted, std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < trusted.observations.size(); ++g) {
     if (!trusted.observations[g].view().is_of_ddq()) continue;
+    const std::string of_log = trusted.observations.size() > 1 ? fmt::format("log {}: ", g + 1) : "";
+    const bool has_lines = g < trusted.lines.size() && !trusted.lines[g].empty();
     for (ConstraintResidual& one : residuals_against_constraints(posterior, trusted, g)) {
       if (!one.is_too_large()) continue;
-      for (int& state : one.worst) {  // numbers of rows below the header
-        const auto at = static_cast<std::size_t>(state);
-        if (g < trusted.lines.size() && at < trusted.lines[g].size()) state = trusted.lines[g][at] - 2;
-      }
-      notes.push_back("warning: " + one.text());
+      for (int& state : one.worst)  // text() writes each plus 1
+        if (has_lines) state = trusted.lines[g][static_cast<std::size_t>(state)] - 1;
+      std::string text = one.text();
+      constexpr std::string_view row = "off: row ", line = "off: line ";
+      if (has_lines) text.replace(text.find(row), row.size(), line);
+      notes.push_back(fmt::format("warning: {}{}", of_log, text));
     }
   }
 }
 
 // Single values that are far off; those of columns of which many are not counted.
-void add_far_value_note(const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
+void add_far_value_note(const Prior& prior, const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
   constexpr double much = 3;  // times the noise, or what the fit is sure of
   const TrainingResidual* farthest = nullptr;
@@ -159,7 +160,7 @@ void add_far_value_note(const TrustedData& trusted, const std::vector<TrainingRe
                                                          : ", in " + place_of(trusted.lines, farthest->group,
                                                                               static_cast<std::size_t>(farthest->farthest_state),
                                                                               trusted.observations.size() == 1);
-  const bool is_open = farthest->rms_in_noise > much * std::max(1.0, farthest->rms);
+  const bool is_open = !prior.reference && farthest->rms_in_noise > much * std::max(1.0, farthest->rms);
   notes.push_back(fmt::format(
       "warning: {} of the values lie six or more standard deviations from their prediction by all others, up to {:.2g} ({}{}): "
       "{}outliers of the log, or rare states at which the fit is overconfident; see `robust`",
@@ -198,8 +199,9 @@ bool denies_constraints(const Posterior& posterior, const TrustedData& trusted) 
 }
 
 void add_residual_notes(const Posterior& posterior, const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
-                        std::vector<std::string>& notes) {
+                        std::vector<std::string>& notes, bool has_fixed_noise) {
   add_constraint_residual_notes(posterior, trusted, notes);
+  const bool is_baseline = posterior.prior().reference != nullptr;
   std::vector<std::string> large, small;
   for (const TrainingResidual& one : residuals) {
     const Observations& group = trusted.observations[one.group];
@@ -211,16 +213,16 @@ void add_residual_notes(const Posterior& posterior, const TrustedData& trusted, 
   if (!large.empty()) {
     notes.push_back(
         fmt::format("warning: values differ from their prediction by all others by more than noise: {}: the noise is stated too "
-                    "small, a column is wrong or lags, a mass, a length or a force is wrong, or the constraints or features miss "
-                    "something; see gp2 check and gp2 report",
-                    fmt::join(large, ", ")));
+                    "small, a column is wrong or lags, {} miss something; see gp2 check and gp2 report",
+                    fmt::join(large, ", "),
+                    is_baseline ? "or the features" : "a mass, a length or a force is wrong, or the constraints or features"));
   }
-  add_far_value_note(trusted, residuals, notes);
+  add_far_value_note(posterior.prior(), trusted, residuals, notes);
   if (small.empty()) return;
   notes.push_back(
       fmt::format("values lie closer to their prediction by all others than the stated noise allows: {}: it is stated too large, "
-                  "or rows share their errors, as smoothed ones do; `noise_std=estimate` finds it",
-                  fmt::join(small, ", ")));
+                  "or rows share their errors, as smoothed ones do{}",
+                  fmt::join(small, ", "), is_baseline || has_fixed_noise ? "" : "; `noise_std=estimate` finds it"));
 }
 
 namespace {
@@ -273,11 +275,15 @@ bool denies_model(const CrossValidation& of, const Evaluation::Part& left_out) {
 std::string causes_text(const Prior& prior) {
   std::vector<std::string> causes;
   if (prior.system->layout().nu > 0) causes.emplace_back("an input that is clipped, late or scaled");
-  causes.emplace_back("a mass, an inertia or a length that is off");
-  causes.emplace_back("a constraint that is missing");
-  if (std::ranges::any_of(prior.latents, &Latent::is_potential))
-    causes.emplace_back("a force that dissipates, which a potential does not");
-  causes.emplace_back("a force that no latent stands for");
+  if (prior.reference) {
+    causes.emplace_back("something that acts and is not among the features");
+  } else {
+    causes.emplace_back("a mass, an inertia or a length that is off");
+    causes.emplace_back("a constraint that is missing");
+    if (std::ranges::any_of(prior.latents, &Latent::is_potential))
+      causes.emplace_back("a force that dissipates, which a potential does not");
+    causes.emplace_back("a force that no latent stands for");
+  }
   causes.emplace_back("a clock that is not that of the samples");
   return fmt::format(
       "Something differs from the model ({}), or the rows are too few, or of one motion, for what the model must learn",
@@ -331,7 +337,7 @@ bool last_beyond_noise(const std::vector<TrainingResidual>& residuals) {
                              [](const TrainingResidual& one) { return one.is_correlated() && one.rms_in_noise > beyond; });
 }
 
-std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
+std::string correlated_text(const std::vector<TrainingResidual>& residuals, bool is_of_baseline) {
   std::vector<std::string> correlated;
   double in_noise = 0;
   for (const TrainingResidual& one : residuals) {
@@ -342,10 +348,10 @@ std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
   }
   if (correlated.empty()) return {};
   if (last_beyond_noise(residuals)) {
-    return fmt::format(
-        "residuals are correlated from row to row, by {}, and {:.2g} times the noise: a mass, a length, a force or a constraint "
-        "of the model is wrong or missing",
-        fmt::join(correlated, ", "), in_noise);
+    return fmt::format("residuals are correlated from row to row, by {}, and {:.2g} times the noise: {}",
+                       fmt::join(correlated, ", "), in_noise,
+                       is_of_baseline ? "something acts that is not among the features"
+                                      : "a mass, a length, a force or a constraint of the model is wrong or missing");
   }
   return fmt::format(
       "residuals are correlated from row to row, by {}: an effect that lasts longer than a sample is missing, and the rows are "

@@ -47,8 +47,9 @@ std::vector<std::string> constraint_warnings(const Posterior& posterior, const s
 bool denies_constraints(const Posterior& posterior, const TrustedData& trusted);
 
 // What the residuals say against the data, the constraints or the noise.
+// @param has_fixed_noise  whether the options of the fit refuse to estimate its noise, as they do for every baseline
 void add_residual_notes(const Posterior& posterior, const TrustedData& trusted, const std::vector<TrainingResidual>& residuals,
-                        std::vector<std::string>& notes);
+                        std::vector<std::string>& notes, bool has_fixed_noise = false);
 
 // Whether the fit says little of what it has not seen, or less than the noise lets it.
 // @param prior  whose possible faults are named
@@ -59,7 +60,7 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
 bool last_beyond_noise(const std::vector<TrainingResidual>& residuals);
 
 // Which residuals go on from row to row; empty where none do.
-std::string correlated_text(const std::vector<TrainingResidual>& residuals);
+std::string correlated_text(const std::vector<TrainingResidual>& residuals, bool is_of_baseline = false);
 
 // How many draws are left out, where there is no posterior under them.
 void add_impossible_note(int n_impossible, int n_draws, std::vector<std::string>& notes);

@@ -341,6 +341,7 @@ LoggedSystem add_system(const Model& model, const Log& log, const FitProblemOpti
 void add_rows(LogRows rows, FitProblem& problem) {
   problem.lines.push_back(std::move(rows.lines));
   problem.commanded.push_back(std::move(rows.commanded));
+  problem.has_wrong_rate = problem.has_wrong_rate || rows.has_wrong_rate;
 }
 
 // Delays and lags of inputs that some observations read.

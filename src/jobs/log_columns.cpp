@@ -12,6 +12,20 @@
 
 namespace gp2 {
 
+namespace {
+
+// Whether a log has what `columns` calls this name of the model. A log may lack a coordinate that nothing reads, but then it has the
+// coordinate's derivatives.
+bool has_column(const System& system, const CsvTable& log, const std::string& name, const std::string& column) {
+  std::vector<std::string> meant = {column};
+  if (std::ranges::count(system.coordinates(), name, &Coordinate::name) > 0) {
+    meant = {column, "d" + column, "dd" + column, column + "_dot", column + "_ddot"};
+  }
+  return std::ranges::any_of(meant, [&](const std::string& one) { return log.find(one) >= 0; });
+}
+
+}  // namespace
+
 std::map<std::string, std::string> columns_of(const Model& model, std::map<std::string, std::string> columns) {
   columns.insert(model.columns.begin(), model.columns.end());
   return columns;
@@ -26,20 +40,22 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
       throw InputError(fmt::format("`map={}={}`: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name,
                                    name, system.name(), fmt::join(known, ", ")));
     }
-    // a log may lack a coordinate that nothing reads, but then it has the coordinate's derivatives
-    std::vector<std::string> meant = {column};
-    const auto& coordinates = system.coordinates();
-    if (std::any_of(coordinates.begin(), coordinates.end(), [&name = name](const auto& one) { return one.name == name; })) {
-      meant = {column, "d" + column, "dd" + column, column + "_dot", column + "_ddot"};
-    }
     std::vector<std::string> lacking;
     for (const CsvTable* log : logs) {
-      if (std::any_of(meant.begin(), meant.end(), [&](const std::string& one) { return log->find(one) >= 0; })) break;
+      if (has_column(system, *log, name, column)) break;
       lacking.push_back(fmt::format("{} has no column '{}'; it has: {}", log->name(), column, fmt::join(log->header(), ", ")));
     }
     if (!logs.empty() && lacking.size() == logs.size())
       throw InputError(fmt::format("`map={}={}`: {}", column, name, fmt::join(lacking, "; ")));
   }
+}
+
+std::map<std::string, std::string> columns_in(const std::vector<const CsvTable*>& logs, const System& system,
+                                              std::map<std::string, std::string> columns) {
+  std::erase_if(columns, [&](const auto& entry) {
+    return std::ranges::none_of(logs, [&](const CsvTable* log) { return has_column(system, *log, entry.first, entry.second); });
+  });
+  return columns;
 }
 
 std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
@@ -81,8 +97,8 @@ std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Mo
   if (!not_in_log.empty())
     notes.push_back(fmt::format("{}: not compared: {}, which it lacks", log.name(), fmt::join(not_in_log, ", ")));
   if (!not_observed.empty()) {
-    notes.push_back(fmt::format("{}: not compared: {}, which the fit did not observe; choose others with `outputs`", log.name(),
-                                fmt::join(not_observed, ", ")));
+    notes.push_back(fmt::format("{}: not compared: {}, which the fit did not observe; `outputs` of an evaluation chooses others",
+                                log.name(), fmt::join(not_observed, ", ")));
   }
   return outputs;
 }

@@ -20,6 +20,10 @@ std::map<std::string, std::string> columns_of(const Model& model, std::map<std::
 void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
                    const std::map<std::string, std::string>& columns);
 
+/// Those of `columns` that one of these logs has.
+std::map<std::string, std::string> columns_in(const std::vector<const CsvTable*>& logs, const System& system,
+                                              std::map<std::string, std::string> columns);
+
 /// columns_of, for logs that are read together.
 /// @throws InputError as check_columns.
 std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,

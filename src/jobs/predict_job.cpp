@@ -14,6 +14,7 @@
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/cross_validation.hpp"
+#include "jobs/acting_inputs.hpp"
 #include "jobs/fit_notes.hpp"
 #include "jobs/log_columns.hpp"
 #include "jobs/reading_notes.hpp"
@@ -113,6 +114,18 @@ Posterior with_equal_directions(const Posterior& posterior) {
   }
   values.inducing = nullptr;
   return {posterior.prior(), evenly(posterior.observations(), enough / posterior.prior().system->nq()), std::move(values)};
+}
+
+// Warns of delays and lags in another unit than t, and returns what else the rates of a log say of its columns.
+std::vector<std::string> note_late_inputs(const PredictedView& at, const CsvTable& log,
+                                          const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
+  const System& system = *at.model->system;
+  double unit_of_time = 1;
+  std::vector<std::string> wrong =
+      wrong_rates_of(system, at.prior, log, checked_columns(*at.model, {&log}, columns), &unit_of_time);
+  if (const auto text = text_of_late_inputs(system, at.prior.reads(), without_estimates(at.actuators), unit_of_time))
+    notes.push_back(fmt::format("warning: {}: {}", log.name(), *text));
+  return wrong;
 }
 
 PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior, const CsvTable& table,
@@ -363,6 +376,7 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
   LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators,
                                   parameters_of(at.view, posterior.values().parameters));
+  if (!std::ranges::all_of(at.actuators, &Actuator::is_direct)) note_late_inputs(at, states, request.columns, log.notes);
   const std::string name = states.name();
   states = CsvTable();  // a long log in memory once
   PredictOutcome out{at.names, {}, std::move(log.notes)};
@@ -430,8 +444,7 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
                                            parameters_of(at.view, posterior.values().parameters));
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
-  for (const std::string& text :
-       wrong_rates_of(*at.model->system, at.prior, log, checked_columns(*at.model, {&log}, request.columns)))
+  for (const std::string& text : note_late_inputs(at, log, request.columns, out.notes))
     out.notes.push_back(fmt::format("warning: {}: {}", name, text));
   add_learned_note(fit, log, out.notes);
   log = CsvTable();

@@ -17,6 +17,7 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "jobs/fit_notes.hpp"
 
 namespace gp2 {
 
@@ -406,13 +407,16 @@ std::optional<PileUp> pile_up(const Ref<const RowVectorXd>& values) {
   return PileUp{value, static_cast<double>(at_end) / static_cast<double>(n)};
 }
 
-std::optional<std::string> clipped_input(const std::string& input, const Ref<const RowVectorXd>& values) {
+std::optional<std::string> pile_up_text(const std::string& name, const Ref<const RowVectorXd>& values,
+                                        const std::string& meaning) {
   const std::optional<PileUp> found = pile_up(values);
   if (!found) return std::nullopt;
-  return fmt::format(
-      "the input {} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: clipped? The "
-      "log must contain the acting input",
-      input, found->value, 100 * found->share);
+  return fmt::format("{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and has many other values: {}", name,
+                     found->value, 100 * found->share, meaning);
+}
+
+std::optional<std::string> clipped_input(const std::string& input, const Ref<const RowVectorXd>& values) {
+  return pile_up_text(fmt::format("the input {}", input), values, "clipped? The log must contain the acting input");
 }
 
 std::vector<Index> far_values(const Ref<const RowVectorXd>& values) {
@@ -441,11 +445,9 @@ std::optional<std::string> far_values_text(const std::string& input, const std::
                                            const std::vector<std::vector<int>>& lines) {
   std::vector<std::string> far;
   for (std::size_t log = 0; log < logs.size(); ++log) {
-    const std::string of_log = logs.size() > 1 ? fmt::format(" of log {}", log + 1) : "";
     for (const Index i : far_values(logs[log])) {
-      const bool has_line = log < lines.size() && !lines[log].empty();
-      const Index row = has_line ? lines[log][static_cast<std::size_t>(i)] - 1 : i + 1;
-      far.push_back(fmt::format("{:.4g} at row {}{}", logs[log][i], row, of_log));
+      const std::string place = place_of(lines, log, static_cast<std::size_t>(i), logs.size() == 1);
+      far.push_back(fmt::format("{:.4g} at {}", logs[log][i], place));
     }
   }
   if (far.empty()) return std::nullopt;

@@ -48,7 +48,10 @@ struct PileUp {
 /// The extreme at which values of a continuous column pile up, neither 0 nor of one that takes a few values only, as one does that is
 /// switched, held or coarsely rounded.
 std::optional<PileUp> pile_up(const Eigen::Ref<const Eigen::RowVectorXd>& values);
-/// What that of an input means.
+/// That values do, and what it may mean.
+std::optional<std::string> pile_up_text(const std::string& name, const Eigen::Ref<const Eigen::RowVectorXd>& values,
+                                        const std::string& meaning);
+/// The same of an input.
 std::optional<std::string> clipped_input(const std::string& input, const Eigen::Ref<const Eigen::RowVectorXd>& values);
 
 /// The few values, at most one in 200 and at least one, that lie thirty times as far from the median as any other; none where all
@@ -56,7 +59,7 @@ std::optional<std::string> clipped_input(const std::string& input, const Eigen::
 std::vector<Eigen::Index> far_values(const Eigen::Ref<const Eigen::RowVectorXd>& values);
 
 /// Which of an input's values in some logs these are, if any.
-/// @param lines  per log: the line of each value, below a header; empty where the values are all rows of the log
+/// @param lines  as place_of
 std::optional<std::string> far_values_text(const std::string& input, const std::vector<Eigen::RowVectorXd>& logs,
                                            const std::vector<std::vector<int>>& lines = {});
 

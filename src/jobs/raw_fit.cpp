@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <map>
 #include <numbers>
 #include <set>
 #include <utility>
@@ -16,6 +17,7 @@
 #include "gp2/simulation/projected_states.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/acting_inputs.hpp"
+#include "jobs/log_columns.hpp"
 #include "jobs/series_checks.hpp"
 
 namespace gp2 {
@@ -282,16 +284,32 @@ std::vector<StateSensitivity> sensitivities_of(const Posterior& posterior, const
   return out;
 }
 
+std::vector<const CsvTable*> tables_of(const std::vector<SideInformation>& also) {
+  std::vector<const CsvTable*> tables;
+  for (const SideInformation& one : also) tables.push_back(&one.log.table);
+  return tables;
+}
+
+// The names of columns that the raw log has; the others are of side information.
+std::map<std::string, std::string> columns_of_raw(const FitRequest& request, const CsvTable& log) {
+  const System& system = *request.model.system;
+  std::vector<const CsvTable*> tables = tables_of(request.also);
+  tables.push_back(&log);
+  check_columns(system, tables, request.problem.columns);
+  return columns_in({&log}, system, request.problem.columns);
+}
+
 // The inputs that the prior reads must be in the raw log: the smoothed one has other columns to tell of.
-void require_inputs(const FitRequest& request, const CsvTable& log) {
-  if (request.problem.baseline) return;  // whose prior is another
+void require_inputs(const FitRequest& request, const CsvTable& log, const std::map<std::string, std::string>& columns) {
+  const bool paper = request.problem.protocol.name == Protocol::Name::paper;
+  // a baseline has another prior; the paper's protocol refuses several latents when the fit is prepared
+  if (request.problem.baseline || (paper && request.model.latents.size() > 1)) return;
   const System& system = *request.model.system;
   FitPriorOptions options;
   options.mean = request.problem.mean;
-  const bool paper = request.problem.protocol.name == Protocol::Name::paper;
   options.base = paper ? std::optional(Latent::Base::acceleration) : request.problem.base;
   const std::vector<bool> reads = make_prior(request.model, options).reads();
-  LogReader reader = open_log(request.model, log, request.problem.columns);
+  LogReader reader = open_log(request.model, log, columns);
   for (std::size_t k = 0; k < system.inputs().size(); ++k) {
     const std::string& input = system.inputs()[k];
     const bool is_read = reads[static_cast<std::size_t>(system.layout().u(static_cast<int>(k)))];
@@ -333,23 +351,35 @@ FitRequest LearnedLog::request(FitRequest asked, const std::string& name) const 
   }
   CsvTable whole = as_table(told, *asked.model.system, name);
   asked.logs = {{.table = whole.take(rows), .windows = windows}};
+  // the smoothed log has the names of the model, side information those of its files
+  asked.problem.columns = columns_in(tables_of(asked.also), *asked.model.system, std::move(asked.problem.columns));
+  std::erase_if(asked.problem.columns, [&](const auto& entry) { return whole.find(entry.second) >= 0; });
   asked.problem.commands = std::move(whole);
-  asked.problem.columns.clear();
   asked.problem.max_points.reset();
   return asked;
+}
+
+FitJob prepare_raw_fit(const LearnedLog& log, FitRequest asked, const std::string& name) {
+  FitJob job = prepare_fit(log.request(std::move(asked), name));
+  if (!log.data.lines.empty()) {
+    for (int& line : job.problem.lines.front()) line = log.data.lines[static_cast<std::size_t>(line - first_line)];
+  }
+  job.file.logs.insert(job.file.logs.begin(), log.files.begin(), log.files.end());
+  return job;
 }
 
 LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, const RawFitOptions& options,
                             const std::atomic<bool>* stop) {
   require_in_range(request);
   if (options.most_passes < 0) throw InputError(fmt::format("`passes`: must not be negative, got {}", options.most_passes));
-  require_inputs(request, log);
   const System& system = *request.model.system;
   DeriveOptions smoothing = options.derive;
-  smoothing.columns = request.problem.columns;
+  smoothing.columns = columns_of_raw(request, log);
+  require_inputs(request, log, smoothing.columns);
   smoothing.stop = stop;
   const auto with_rows = [&](DerivedData data) {
     LearnedLog out{std::move(data), {}, {}, {}, {}};
+    if (log.file()) out.files = {*log.file()};
     const CsvTable table = as_table(out.data, system, log.name());
     const int n = std::min(request.problem.max_points.value_or(n_raw_rows), table.n_rows());
     out.rows = resample(request.model, table, {.n = n}).rows;

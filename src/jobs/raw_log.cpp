@@ -24,13 +24,6 @@ namespace {
 
 constexpr std::size_t least_rows = 5;
 
-/// An empty cell, or one of the words that loggers write instead.
-bool is_missing(const std::string& cell) {
-  std::string word = cell;
-  for (char& c : word) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
-  return word.empty() || word == "nan" || word == "-nan" || word == "na" || word == "null" || word == "none";
-}
-
 // A whole number, all of the text.
 std::optional<int> whole_number(std::string_view text) {
   int number = 0;
@@ -162,6 +155,12 @@ void check_options(const DeriveOptions& options) {
 }
 
 }  // namespace
+
+bool is_missing(const std::string& cell) {
+  std::string word = cell;
+  for (char& c : word) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+  return word.empty() || word == "nan" || word == "-nan" || word == "na" || word == "null" || word == "none";
+}
 
 RawLog::RawLog(const Model& model, const CsvTable& log, const DeriveOptions& options)
     : system_(*model.system), log_(log), options_(options), reader_(open_log(model, log, options.columns)) {

@@ -12,6 +12,9 @@
 
 namespace gp2 {
 
+/// Whether a cell is empty, or holds one of the words that loggers write instead of a value.
+bool is_missing(const std::string& cell);
+
 /// Rows of one episode in the log, and their times.
 struct Episode {
   std::string label;

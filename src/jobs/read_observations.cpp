@@ -105,7 +105,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   note_violation(system, readings.states, logged.parameters, log.table.name(), notes, &options);
   note_repeated_rows({readings.states, readings.values}, log.table.name(), notes);
   if (!logged.other) note_rest(logged.model, logged.parameters, readings.states, readings.values, log.table.name(), notes);
-  if (!log.windows) note_channels(logged.prior, log.table, columns, notes);
+  const bool has_wrong_rate = !log.windows && note_channels(logged.prior, log.table, columns, logged.actuators, notes);
 
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table.name(), notes);
@@ -117,7 +117,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   const bool reads_time = logged.prior.reads()[static_cast<std::size_t>(system.layout().t())];
   if (!reads_time) rows = in_order_of_time(std::move(rows), system, log.table, columns);
   if (static_cast<int>(rows.size()) < n_rows || !std::ranges::is_sorted(rows)) readings.keep(rows);
-  of_log = {lines_of(rows, log.table), estimated_at(std::move(commanded), rows)};
+  of_log = {lines_of(rows, log.table), estimated_at(std::move(commanded), rows), has_wrong_rate};
   require_mechanics_at(logged, readings.view, readings.states, rows, log.table.name(), notes);
   note_shared_loads(logged, readings.states, log.table.name(), notes);
 

@@ -325,14 +325,34 @@ std::vector<std::string> wrong_rates_of(const System& system, const Prior& prior
   return wrong_rates(system, motion->states, motion->accelerations, reads_time, unit);
 }
 
-void note_channels(const Prior& prior, const CsvTable& log, const std::map<std::string, std::string>& columns,
-                   std::vector<std::string>& notes) {
+std::optional<std::string> text_of_late_inputs(const System& system, const std::vector<bool>& reads,
+                                               const std::vector<Actuator>& actuators, double unit_of_time) {
+  std::vector<std::string> names;
+  for (std::size_t k = 0; k < actuators.size(); ++k) {
+    if (!reads[static_cast<std::size_t>(system.layout().u(static_cast<int>(k)))]) continue;
+    for (const Parameter* const one : {&actuators[k].delay, &actuators[k].lag}) {
+      if (one->value != 0 || one->estimate) names.push_back(one->name);
+    }
+  }
+  if (unit_of_time == 1 || names.empty()) return std::nullopt;
+  return fmt::format(
+      "the rates of the coordinates say that t counts {:g} s, while delays and lags of inputs are in seconds ({}): "
+      "inputs act at a wrong time; convert t",
+      unit_of_time, fmt::join(names, ", "));
+}
+
+bool note_channels(const Prior& prior, const CsvTable& log, const std::map<std::string, std::string>& columns,
+                   const std::vector<Actuator>& actuators, std::vector<std::string>& notes) {
   const auto warn = [&](const std::vector<std::string>& texts) {
     for (const std::string& text : texts) notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
   };
-  warn(wrong_rates_of(*prior.system, prior, log, columns));
+  double unit_of_time = 1;
+  std::vector<std::string> wrong = wrong_rates_of(*prior.system, prior, log, columns, &unit_of_time);
+  if (const auto text = text_of_late_inputs(*prior.system, prior.reads(), actuators, unit_of_time)) wrong.push_back(*text);
+  warn(wrong);
   if (const auto motion = read_motion(*prior.system, log, columns))
     warn(stuck_channels(*prior.system, motion->states, motion->accelerations));
+  return !wrong.empty();
 }
 
 std::vector<std::string> shared_load_texts(const Model& model, const System& system, const MechanicsBatch& mechanics) {

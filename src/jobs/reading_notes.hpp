@@ -1,11 +1,13 @@
 #pragma once
 
 #include <map>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "gp2/actuator.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "jobs/readings.hpp"
 
@@ -51,9 +53,18 @@ std::vector<std::string> wrong_rates_of(const System& system, const Prior& prior
 std::vector<std::string> stuck_channels(const System& system, const Eigen::MatrixXd& states,
                                         const Eigen::MatrixXd& accelerations);
 
-/// Warns of wrong rates, and of channels that are stuck for a while.
-void note_channels(const Prior& prior, const CsvTable& log, const std::map<std::string, std::string>& columns,
-                   std::vector<std::string>& notes);
+/// That inputs act at a wrong time where t is in another unit than their delays and lags; nothing where it is in seconds, or where no
+/// input that is read acts late.
+/// @param reads         which entries of a state are read
+/// @param unit_of_time  as wrong_rates tells it [s]
+std::optional<std::string> text_of_late_inputs(const System& system, const std::vector<bool>& reads,
+                                               const std::vector<Actuator>& actuators, double unit_of_time);
+
+/// Warns of wrong rates, of delays in another unit than t, and of channels that are stuck for a while.
+/// @param actuators  of the inputs of the log
+/// @returns whether rates or delays are wrong, which makes sound inputs look wrong
+bool note_channels(const Prior& prior, const CsvTable& log, const std::map<std::string, std::string>& columns,
+                   const std::vector<Actuator>& actuators, std::vector<std::string>& notes);
 
 /// Of each multiplier that latents of a model read while its constraint follows from others: which share of the load is its own is then
 /// a choice.

@@ -154,6 +154,12 @@ void relevance_advice(const Report& report, std::vector<Advice>& advice) {
   }
 }
 
+// A fit may have chosen the rows that it learned from, so that they are not numbered as those of the log.
+std::string kept_row_text(const ReportData& data, int state) {
+  return data.is_test ? fmt::format("row {} of {}", state + 1, data.name)
+                      : fmt::format("row {} of the rows that {} kept", state + 1, data.name);
+}
+
 void constraint_advice(const Report& report, std::vector<Advice>& advice) {
   std::vector<std::string> names;
   const ReportData* worst = nullptr;
@@ -166,9 +172,9 @@ void constraint_advice(const Report& report, std::vector<Advice>& advice) {
   const ConstraintViolation& violation = *worst->violation;
   advice.push_back(
       {violation.relative > large_constraint_violation ? Level::warning : Level::note,
-       fmt::format("States of the {} data are off the constraint. The farthest, row {} of {}: {} = {:.3g}, {:.2g} of "
+       fmt::format("States of the {} data are off the constraint. The farthest, {}: {} = {:.3g}, {:.2g} of "
                    "its scale.",
-                   fmt::join(names, " and "), violation.state + 1, worst->name, violation.constraint, violation.value,
+                   fmt::join(names, " and "), kept_row_text(*worst, violation.state), violation.constraint, violation.value,
                    violation.relative),
        "Small values are measurement noise, or estimated parameters, and do no harm. Large ones mean wrong units, signs or "
        "offsets of a column, or wrong parameters of the constraint: estimate them with `estimate`."});
@@ -178,13 +184,13 @@ void rank_advice(const Report& report, std::vector<Advice>& advice) {
   for (const ReportData& data : report.data) {
     const LowerRank& lower = data.lower_rank;
     if (lower.states.empty()) continue;
-    advice.push_back(
-        {Level::warning,
-         fmt::format("The constraints have rank {} but at {} of {} states of the {} data, where it is as low as {}, "
-                     "first at row {}.",
-                     lower.usual, lower.states.size(), data.states.cols(), data.name, lower.lowest, lower.states.front() + 1),
-         "One constraint less holds there, as at a dead centre of a linkage. If the machine has none, look whether "
-         "a row vanishes only as it is written: gp2 check names it."});
+    advice.push_back({Level::warning,
+                      fmt::format("The constraints have rank {} but at {} of {} states of the {} data, where it is as low as {}, "
+                                  "first at {}.",
+                                  lower.usual, lower.states.size(), data.states.cols(), data.name, lower.lowest,
+                                  kept_row_text(data, lower.states.front())),
+                      "One constraint less holds there, as at a dead centre of a linkage. If the machine has none, look whether "
+                      "a row vanishes only as it is written: gp2 check names it."});
   }
 }
 

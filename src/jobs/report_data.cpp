@@ -241,6 +241,8 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   const std::vector<std::string> wrong =
       wrong_rates_of(system, at.prior, table, checked_columns(*at.model, {&table}, request.columns), &unit_of_time);
   for (const std::string& text : wrong) data.notes.push_back(fmt::format("warning: {}: {}", table.name(), text));
+  if (const auto text = text_of_late_inputs(system, at.prior.reads(), without_estimates(at.actuators), unit_of_time))
+    data.notes.push_back(fmt::format("warning: {}: {}", table.name(), *text));
   if (unit_of_time != 1) {
     data.states.row(system.layout().t()) *= unit_of_time;
     data.notes.push_back(

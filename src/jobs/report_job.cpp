@@ -120,7 +120,7 @@ std::vector<std::string> notes_of_fit(const FitFile& fit, const Posterior& poste
   if (fit.report.inducing) add_inducing_note(*fit.report.inducing, notes);
   add_residual_notes(posterior, {posterior.observations()}, cross_validation.residuals, notes);
   add_stretch_note(cross_validation, notes, posterior.prior());
-  const std::string correlated = correlated_text(cross_validation.residuals);
+  const std::string correlated = correlated_text(cross_validation.residuals, fit.prior_options.baseline.has_value());
   if (!correlated.empty()) notes.push_back(correlated);
   return notes;
 }

@@ -38,13 +38,14 @@ struct RolloutLimits {
 using Part = std::pair<Index, Index>;
 
 // Entries of the state that a motion needs and the data lack.
-std::vector<std::string> missing_entries(const System& system, const std::vector<Contact>& contacts, const MatrixXd& states) {
-  const std::vector<std::string> names = system.state_names();
+std::vector<std::string> missing_entries(const Model& model, const MatrixXd& states) {
+  const StateLayout layout = model.system->layout();
+  const std::vector<std::string> names = model.system->state_names(), driving = driving_inputs(model);
   std::vector<std::string> missing;
-  for (int k = 0; k < system.layout().size(); ++k) {
-    const bool follows =
-        std::any_of(contacts.begin(), contacts.end(), [&](const Contact& one) { return system.layout().u(one.input) == k; });
-    if (!follows && !states.row(k).allFinite()) missing.push_back(names[static_cast<std::size_t>(k)]);
+  for (int k = 0; k < layout.size(); ++k) {
+    const std::string& name = names[static_cast<std::size_t>(k)];
+    const bool is_needed = k <= layout.t() || std::ranges::count(driving, name) > 0;
+    if (is_needed && !states.row(k).allFinite()) missing.push_back(name);
   }
   return missing;
 }
@@ -154,8 +155,7 @@ class Roll {
     const StateLayout layout = system_.layout();
     const VectorXd& fitted = posterior_.values().parameters;
     const VectorXd parameters = asked_.other_system ? asked_.other_system->parameters(fitted) : fitted;
-    const std::vector<Contact> contacts = contacts_of(*asked_.model, parameters);
-    if (const std::vector<std::string> missing = missing_entries(system_, contacts, states); !missing.empty()) {
+    if (const std::vector<std::string> missing = missing_entries(*asked_.model, states); !missing.empty()) {
       out.reason = fmt::format("the data lack {}", fmt::join(missing, ", "));
       return;
     }

@@ -15,6 +15,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulate.hpp"
 #include "jobs/acting_inputs.hpp"
+#include "jobs/rate_check.hpp"
 #include "simulation/contacts.hpp"
 
 namespace gp2 {
@@ -27,11 +28,21 @@ namespace {
 
 constexpr Index least_rows_of_stretch = 8;
 
+void require_seconds(const System& system, const MatrixXd& states, const std::string& log) {
+  double unit_of_time = 1;
+  wrong_rates(system, states, MatrixXd::Constant(system.nq(), states.cols(), not_a_number), /*reads_time=*/false, &unit_of_time);
+  if (unit_of_time == 1) return;
+  throw InputError(fmt::format(
+      "{}: the rates of the coordinates say that t counts {:g} s, not seconds, over which motions are followed: convert it", log,
+      unit_of_time));
+}
+
 void read_columns(const Model& model, const CsvTable& table, const std::map<std::string, std::string>& columns, ShootingLog& log,
                   std::vector<std::string>& notes) {
   const System& system = *model.system;
   LogReader reader = open_log(model, table, columns);
   log.states = reader.states(std::vector<bool>(static_cast<std::size_t>(system.layout().size()), true));
+  require_seconds(system, log.states, table.name());
   take_commands(system, without_estimates(model.actuators), reader, std::nullopt, columns, log.states, notes);
   for (int j = 0; j < system.nq(); ++j) {
     const std::string& name = system.coordinates()[static_cast<std::size_t>(j)].name;

@@ -263,6 +263,11 @@ std::string error_text(double stddev) {
   return std::isnan(stddev) ? "" : std::isinf(stddev) ? " ± ∞" : fmt::format(" ± {:.2g}", stddev);
 }
 
+// Whether a standard error of it is told.
+bool has_standard_error(const Hyperparameter& h) {
+  return h.is_system_parameter() || h.kind == Hyperparameter::Kind::noise_stddev;
+}
+
 std::string draws_text(const FitReport& report) {
   const HyperparameterDraws& draws = *report.draws;
   Eigen::Index slowest = 0, worst = 0;
@@ -298,17 +303,24 @@ std::string show(const FitFile& fit, const ShowRequest& request, const Spelling&
   if (!request.json) {
     const std::string said = notes.empty() ? "" : fmt::format("\nnotes\n  {}\n", fmt::join(notes, "\n  "));
     std::string found = text_of(fit.report, fit.model);
-    // what a fit said goes as soon as its rows change
-    if (!fit.notes) found.insert(found.find('\n'), ", at the fit; rows may have changed since");
+    // what a fit said goes as soon as its rows change; a checkpoint has said nothing yet
+    if (!fit.notes && !fit.report.restarts.empty())
+      found.insert(found.find('\n'), ", at the last fit or shoot; rows may have changed since");
     return fmt::format("learned from {} states of {}\n{}{}\n{}", n_states, fit.data_source, found, said, of_model);
   }
-  OrderedJson json = OrderedJson::parse(of_model), hyperparameters = OrderedJson::object();
-  for (const Hyperparameter& h : fit.report.hyperparameters) hyperparameters[h.name] = h.value;
+  OrderedJson json = OrderedJson::parse(of_model), hyperparameters = OrderedJson::object(), stddevs = OrderedJson::object();
+  for (const ActuatorEstimate& one : fit.report.actuators) stddevs[one.name] = one.stddev;
+  for (std::size_t k = 0; k < fit.report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = fit.report.hyperparameters[k];
+    hyperparameters[h.name] = h.value;
+    if (has_standard_error(h)) stddevs[h.name] = parameter_uncertainty(fit.report, k).stddev;
+  }
   json["fit"] = {{"data", fit.data_source},
                  {"states", n_states},
                  {"nll", fit.report.negative_log_likelihood},
                  {"termination", fit.report.termination},
                  {"hyperparameters", hyperparameters},
+                 {"stddev", stddevs},
                  {"notes", notes},
                  {"options", fit.options.empty() ? OrderedJson() : OrderedJson::parse(fit.options)}};
   return text_of(json);
@@ -342,7 +354,7 @@ std::string text_of(const FitReport& report, const Model& model) {
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
     std::string error;
-    if (h.is_system_parameter() || h.kind == Hyperparameter::Kind::noise_stddev) {
+    if (has_standard_error(h)) {
       const ParameterUncertainty known = parameter_uncertainty(report, k);
       error = error_text(known.stddev);
       if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.6g} … {:.6g})", known.mean, known.lower, known.upper);

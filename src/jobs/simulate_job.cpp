@@ -171,11 +171,7 @@ InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuat
   if (system.inputs().empty()) throw InputError(fmt::format("`inputs`: '{}' has no inputs", system.name()));
   LogReader reader(table, system, columns);
   const VectorXd times = reader.values({"t"}).row(0).transpose();
-  // whether there is contact follows from the motion
-  std::vector<std::string> given = system.inputs();
-  for (const Contact& contact : contacts_of(model, system.parameter_values())) {
-    std::erase(given, system.inputs()[static_cast<std::size_t>(contact.input)]);
-  }
+  const std::vector<std::string> given = driving_inputs(model);
   const MatrixXd read = reader.values(given);
   MatrixXd values = MatrixXd::Zero(system.layout().nu, times.size());
   for (std::size_t k = 0; k < given.size(); ++k) {
@@ -236,6 +232,14 @@ std::vector<Option> options(SimulateRequest& request) {
       {"seed", &request.seed, "K", "random seed of the samples", "", "", "", "samples"},
       columns_option(request.columns, "columns by other names, in all logs"),
   };
+}
+
+std::vector<std::string> driving_inputs(const Model& model) {
+  const System& system = *model.system;
+  std::vector<std::string> driving = system.inputs();
+  for (const Contact& contact : contacts_of(model, system.parameter_values()))
+    std::erase(driving, system.inputs()[static_cast<std::size_t>(contact.input)]);
+  return driving;
 }
 
 std::optional<double> start_time(const Model& model, const MotionStart& start,
@@ -471,18 +475,26 @@ MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajector
   return out;
 }
 
+const SimulatedMotion* first_to_leave(const std::vector<SimulatedMotion>& motions) {
+  const auto leaves_at = [](const SimulatedMotion& one) {
+    return one.uncertainty ? one.uncertainty->leaves_data.value_or(HUGE_VAL) : HUGE_VAL;
+  };
+  const auto first = std::ranges::min_element(motions, {}, leaves_at);
+  return first == motions.end() || leaves_at(*first) == HUGE_VAL ? nullptr : &*first;
+}
+
 std::vector<std::string> motion_notes(const std::vector<SimulatedMotion>& motions) {
   std::vector<std::string> notes;
-  bool has_left = false, has_jumped = false, has_lost_rank = false;  // one before
+  const SimulatedMotion* const leaving = first_to_leave(motions);
+  bool has_jumped = false, has_lost_rank = false;  // one before
   for (std::size_t k = 0; k < motions.size(); ++k) {
     const Trajectory& motion = motions[k].trajectory;
-    const std::optional<MotionUncertainty>& uncertainty = motions[k].uncertainty;
     const std::string called = motions.size() > 1 ? fmt::format("sample {}", k) : "the motion";
-    if (uncertainty && uncertainty->leaves_data && !std::exchange(has_left, true)) {
+    if (&motions[k] == leaving) {
       notes.push_back(fmt::format(
           "warning: {} leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "
           "observed states as those are from each other",
-          called, *uncertainty->leaves_data, uncertainty->distance.maxCoeff()));
+          called, *leaving->uncertainty->leaves_data, leaving->uncertainty->distance.maxCoeff()));
     }
     if (motion.largest_jump > 0 && !std::exchange(has_jumped, true)) {
       notes.push_back(

@@ -24,6 +24,16 @@ std::vector<double> spaces_of(const std::vector<Measurement>& used) {
   return spaces;
 }
 
+/// A model whose noise is that of the readings and of their times together, at the usual speed.
+SmootherModel with_noise_of_times(SmootherModel model, const std::vector<Measurement>& used) {
+  double squares = 0, n = 0;
+  for (const Measurement& one : used) {
+    if (!one.velocity) squares += one.rate * one.rate, ++n;
+  }
+  model.noise_stddev = std::hypot(model.noise_stddev, model.time_stddev * std::sqrt(squares / std::max(1.0, n)));
+  return model;
+}
+
 /// p = q̂ − r with r̈ + 2ω ṙ + ω² r = misfit, which is linear between the times; r is at rest at the first.
 /// @param motion  q̂ and its derivatives
 Matrix3Xd motion_without(const Matrix3Xd& motion, const VectorXd& times, const RowVectorXd& misfit, double w) {
@@ -83,7 +93,7 @@ void SmoothedSeries::take_learned(const LearnedSeries& learned, const SmootherFi
   RowVectorXd misfit = plain.mean.row(2) - learned.mean;
   // as slow as drift needs: what follows the samples below ω has their noise
   constexpr double share = 0.01;
-  const double bandwidth = bandwidth_of(model, median(spaces_of(fit.trusted)));
+  const double bandwidth = bandwidth_of(with_noise_of_times(model, fit.trusted), median(spaces_of(fit.trusted)));
   const double w = 2 * std::numbers::pi * share * std::max(bandwidth, 1 / times[times.size() - 1]);
 
   const SmootherFit tried =
@@ -142,8 +152,11 @@ DerivedSeries SmoothedSeries::report() const {
   out.coordinate = coordinate;
   out.episode = episode;
   out.model = model;
-  out.noise_at_least = fit.noise_at_least && channel.resolution > 0;
-  out.noise_unseen = fit.noise_at_least && !out.noise_at_least;
+  const SmootherModel usual_model = with_noise_of_times(model, used);
+  // what the times add may be noise of the readings, which at one speed cannot be distinguished
+  const bool noise_at_least = fit.noise_at_least && usual_model.noise_stddev < 2 * model.noise_stddev;
+  out.noise_at_least = noise_at_least && channel.resolution > 0;
+  out.noise_unseen = noise_at_least && channel.resolution == 0;
   out.shared_model = shared_model;
   out.kurtosis = kurtosis;
   out.gain = gain;
@@ -162,7 +175,7 @@ DerivedSeries SmoothedSeries::report() const {
     out.longest_gap = std::max(out.longest_gap, space);
   }
   out.rate = 1 / usual;
-  out.bandwidth = bandwidth_of(model, usual);
+  out.bandwidth = bandwidth_of(usual_model, usual);
   return out;
 }
 

@@ -20,9 +20,13 @@
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
+#include "jobs/acting_inputs.hpp"
+#include "jobs/chosen_rows.hpp"
 #include "jobs/fit_notes.hpp"
 #include "jobs/log_columns.hpp"
 #include "jobs/observation_noise.hpp"
+#include "jobs/read_states.hpp"
+#include "jobs/reading_notes.hpp"
 #include "jobs/repeated_rows.hpp"
 
 namespace gp2 {
@@ -44,10 +48,12 @@ std::vector<Option> options(UpdateRequest& request) {
 namespace {
 
 // The noise of more rows: what the log states, as the fit does, times its factor where it has one; else that of the fit. Of several
-// logs with a noise each the largest. A value that should have a deviation in the log and has none counts as not measured.
-Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& view, const std::vector<std::string>& names,
-                    LogStates& read, const UpdateRequest& request, const CsvTable& log, std::vector<std::string>& notes) {
-  const std::vector<std::string> stated = stated_accelerations(names, open_log(fit.model, log, request.columns));
+// logs with a noise each the largest.
+// @param stated  the names whose standard deviations the log states
+Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const Readings& readings,
+                    const std::vector<std::string>& names, const std::vector<std::string>& stated, const UpdateRequest& request,
+                    const CsvTable& log, std::vector<std::string>& notes) {
+  const View& view = readings.view;
   if (request.noise_stddev) {
     if (!stated.empty()) {
       notes.push_back(fmt::format("{}: `noise_std={}` replaces the standard deviations in {}", log.name(), *request.noise_stddev,
@@ -56,7 +62,7 @@ Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& 
     return Noise(VectorXd::Constant(view.size(), *request.noise_stddev));
   }
   VectorXd stddev(view.size());
-  MatrixXd scale = MatrixXd::Ones(view.size(), read.states.cols());
+  MatrixXd scale = MatrixXd::Ones(view.size(), readings.states.cols());
   const std::vector<Observations>& groups = posterior.observations();
   for (Index k = 0; k < stddev.size(); ++k) {
     const std::string& name = names[static_cast<std::size_t>(k)];
@@ -75,10 +81,7 @@ Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& 
       most = std::max(most, sigma);
     }
     if (states_noise) {
-      scale.row(k) = read.stated_stddev.row(k);
-      for (Index i = 0; i < scale.cols(); ++i) {
-        if (std::isnan(scale(k, i))) read.accelerations(k, i) = not_a_number;
-      }
+      scale.row(k) = readings.stated_stddev.row(k);
     } else if (!is_observed) {
       throw InputError(fmt::format("`noise_std`: {} was not observed in the fit; give its noise standard deviation", name));
     } else if (most == 0) {
@@ -197,7 +200,9 @@ std::string offset_text(const std::vector<double>& z) {
 }
 
 // Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones.
-void note_unexpected(const Posterior& posterior, const Observations& more, const CsvTable& log, std::vector<std::string>& notes) {
+// @param rows  of the log, of each state
+void note_unexpected(const Posterior& posterior, const Observations& more, const std::vector<int>& rows, const CsvTable& log,
+                     std::vector<std::string>& notes) {
   constexpr int most_states = 1000, fewest_values = 10;  // of each column
   constexpr std::int64_t fewest_learned = 30;            // fits of fewer states are sure of too much
   constexpr double few = 0.2;                            // of a column's values
@@ -240,8 +245,8 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
       ++n_wrong;
       if (size <= worst) continue;
       worst = size;
-      where = fmt::format("{}, at row {} of what is learned from it", names[static_cast<std::size_t>(k)],
-                          taken[static_cast<std::size_t>(i)] + 1);
+      where = fmt::format("{}, at row {}", names[static_cast<std::size_t>(k)],
+                          rows[static_cast<std::size_t>(taken[static_cast<std::size_t>(i)])] + 1);
     }
   }
   if (!others.empty()) {
@@ -307,28 +312,44 @@ void extend_range(Posterior& posterior, FitFile& fit, const Observations& more) 
   set_prior(posterior, fit.prior());
 }
 
-// Of the accelerations those that a log measures at some row. Of a block of few rows one may be measured at none; the reader would take
-// that for a mistake.
-std::vector<std::string> measured_somewhere(std::vector<std::string> names, const LogReader& reader,
-                                            const UpdateRequest& request) {
-  const auto is_empty = [&](const std::string& column) {
-    const int at = reader.table().find(column);
-    return at >= 0 && reader.table().is_empty(at);
-  };
-  std::erase_if(names, [&](const std::string& name) {
-    const bool lacks_stddevs = !request.noise_stddev && is_empty(reader.stddev_column(name));
-    return reader.has(name) && (!reader.measures(name) || lacks_stddevs);
-  });
-  return names;
-}
-
 // Rows of some of the names as rows of all: what is not among them is not measured.
-MatrixXd among(const std::vector<std::string>& all, const std::vector<std::string>& some, const MatrixXd& of_some, int n_rows) {
-  MatrixXd values = MatrixXd::Constant(std::ssize(all), n_rows, not_a_number);
+MatrixXd among(const std::vector<std::string>& all, const std::vector<std::string>& some, const MatrixXd& of_some) {
+  MatrixXd values = MatrixXd::Constant(std::ssize(all), of_some.cols(), not_a_number);
   for (Index k = 0; k < of_some.rows(); ++k) {
     values.row(std::ranges::find(all, some[static_cast<std::size_t>(k)]) - all.begin()) = of_some.row(k);
   }
   return values;
+}
+
+// Reads what a log measures of these names, as a fit does.
+// @param readings  receives it; its view is given
+// @return the rows of the log that measure something at known acting inputs
+std::vector<int> read_more(const FitFile& fit, const Posterior& posterior, const std::vector<std::string>& names,
+                           bool reads_stddevs, LogReader& reader, Readings& readings, std::vector<std::string>& notes) {
+  const Prior& prior = posterior.prior();
+  const VectorXd& parameters = posterior.values().parameters;
+  const CsvTable& log = reader.table();
+  const bool projects = !fit.options.empty() && request_of(fit).problem.project;
+  // a block of few rows may have no value of a column, which the reader takes for a mistake
+  std::vector<std::string> measured = names;
+  std::erase_if(measured, [&](const std::string& name) { return reader.has(name) && !reader.measures(name); });
+  readings.states = read_states(prior, readings.view, reader, projects);
+  readings.values = among(names, measured, reader.measurements(measured));
+  if (reads_stddevs) readings.stated_stddev = among(names, measured, stated_stddevs(fit.model, measured, reader, log.n_rows()));
+  const std::optional<CommandedRows> commanded =
+      take_commands(*prior.system, without_estimates(fit.model.actuators), reader, std::nullopt, {}, readings.states, notes);
+  const MatrixXd state_stddevs = projects ? stated_state_deviations(*prior.system, reader) : MatrixXd();
+  note_reading(reader, notes);
+  if (projects) move_onto_constraints(*prior.system, parameters, log, state_stddevs, readings.states, notes);
+  note_violation(*prior.system, readings.states, parameters, log.name(), notes);
+  if (measured.empty()) return {};
+  note_rest(fit.model, parameters, readings.states, readings.values, log.name(), notes);
+  std::vector<int> rows = measured_rows(readings, names, log.name(), notes);
+  if (commanded) {
+    clear_unknown(*commanded, log, readings.values, notes);
+    std::erase_if(rows, [&](int row) { return readings.values.col(row).array().isNaN().all(); });
+  }
+  return rows;
 }
 
 void require_window(const Posterior& posterior, const UpdateRequest& request) {
@@ -338,6 +359,11 @@ void require_window(const Posterior& posterior, const UpdateRequest& request) {
     throw InputError(
         "`window`: what was learned through inducing points cannot be taken away, since the observations themselves are not "
         "kept; `forget` discounts it");
+  }
+  if (std::ranges::any_of(posterior.observations(), &Observations::has_sums)) {
+    throw InputError(
+        "`window`: the fit learned from windows of a raw log, of which single rows cannot be taken away; fit the newest logs "
+        "again, or this one with `windows=none`");
   }
 }
 
@@ -353,10 +379,42 @@ std::vector<Observations> newest_of(const std::vector<Observations>& groups, std
   return newest;
 }
 
-// Whether one of the logs that the newest n states are of, by the rows of these, has the content of this one.
-bool has_among_newest(const FitFile& fit, const LogFile& log, std::int64_t n) {
-  for (auto known = fit.logs.rbegin(); known != fit.logs.rend() && n > 0; n -= (known++)->rows) {
+// The logs of a fit with the number of their rows that it learned. A fit to which nothing was added has a group of observations for each.
+std::vector<LogFile> counted_logs(const FitFile& fit, const Posterior& posterior) {
+  const std::vector<Observations>& groups = posterior.observations();
+  std::vector<LogFile> logs = fit.logs;
+  if (!fit.notes || posterior.summary()) return logs;
+  const bool has_group_of_each = groups.size() == logs.size();
+  for (std::size_t k = 0; k < logs.size(); ++k)
+    logs[k].n_learned = has_group_of_each ? std::optional<std::int64_t>(groups[k].n_data()) : std::nullopt;
+  return logs;
+}
+
+// Strikes the logs of which none of the newest n states is. One whose number of rows is not known stays until later ones have as many.
+void keep_logs_of_newest(FitFile& fit, std::int64_t n) {
+  auto oldest = fit.logs.end();
+  while (oldest != fit.logs.begin() && n > 0) {
+    std::optional<std::int64_t>& n_here = (--oldest)->n_learned;
+    if (n_here) n_here = std::min(*n_here, n);
+    n -= n_here.value_or(0);
+  }
+  if (oldest == fit.logs.begin()) return;
+  fit.logs.erase(fit.logs.begin(), oldest);
+  fit.data_source.clear();
+  for (const LogFile& log : fit.logs) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name;
+}
+
+// Removes all but the newest n states.
+void leave_newest(Posterior& posterior, FitFile& fit, std::int64_t n) {
+  const std::int64_t n_old = posterior.n_states() - n;
+  if (n_old > 0) posterior = remove_oldest(std::move(posterior), fit, static_cast<int>(n_old));
+}
+
+// Whether one of the logs that the newest n states are of has the content of this one.
+bool has_among_newest(const std::vector<LogFile>& logs, const LogFile& log, std::int64_t n) {
+  for (auto known = logs.rbegin(); known != logs.rend() && n > 0; ++known) {
     if (known->checksum == log.checksum && known->bytes == log.bytes) return true;
+    n -= known->n_learned.value_or(known->rows);
   }
   return false;
 }
@@ -379,44 +437,33 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   if (names.empty() && own != groups.end()) names = own->view().names(system);
   view.rows = acceleration_rows(system, names, "`observe`");
   if (names.empty()) names = view.names(system);
-  const bool projects = !fit.options.empty() && request_of(fit).problem.project;
-  const LogReader reader = open_log(fit.model, log, request.columns);
-  const std::vector<std::string> measured = measured_somewhere(names, reader, request);
-  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, measured, {},
-                                   posterior.values().parameters, projects);
-  if (measured.size() < names.size()) {
-    read.accelerations = among(names, measured, read.accelerations, log.n_rows());
-    if (!stated_accelerations(names, reader).empty())
-      read.stated_stddev = among(names, measured, read.stated_stddev, log.n_rows());
-  }
-
-  Noise noise = noise_of_more(fit, posterior, view, names, read, request, log, notes);
-  notes.insert(notes.end(), read.notes.begin(), read.notes.end());
-  std::vector<int> rows;  // that measure something
-  for (int i = 0; i < static_cast<int>(read.accelerations.cols()); ++i) {
-    if (!read.accelerations.col(i).array().isNaN().all()) rows.push_back(i);
-  }
+  LogReader reader = open_log(fit.model, log, request.columns);
+  const std::vector<std::string> stated = stated_accelerations(names, reader);
+  Readings readings{std::move(view), {}, {}, {}};
+  const std::vector<int> rows =
+      read_more(fit, posterior, names, !stated.empty() && !request.noise_stddev, reader, readings, notes);
+  Noise noise = noise_of_more(fit, posterior, readings, names, stated, request, log, notes);
   if (rows.empty()) {
     notes.push_back(
         fmt::format("warning: {}: nothing is learned from it: no row has a measured value and known acting inputs", log.name()));
   }
-  noise = noise.take(rows);
-  Observations more{read.states(Eigen::all, rows), std::move(view), read.accelerations(Eigen::all, rows),
-                    Noise(noise.stddev(), false, noise.scale())};
+  const Observations all{std::move(readings.states), std::move(readings.view), std::move(readings.values), std::move(noise)};
+  Observations more = all.take(rows);
   require_usable_noise(posterior, more, log, rows, request.noise_stddev.has_value());
   // rows that the window leaves behind do not count twice
   const std::int64_t n_left = request.window ? *request.window - more.n_data() : posterior.n_states();
-  if (log.file() && (request.window ? has_among_newest(fit, *log.file(), n_left) : fit.has_learned(*log.file()))) {
+  if (log.file() &&
+      (request.window ? has_among_newest(counted_logs(fit, posterior), *log.file(), n_left) : fit.has_learned(*log.file()))) {
     notes.push_back(fmt::format("warning: {} is already in the fit: its rows count twice", log.name()));
   } else {
     note_shared_rows(request.window ? newest_of(groups, n_left) : groups, {more}, notes);
   }
   try {
-    for (std::string& text : constraint_warnings(posterior, nullptr, log.name(), more.states(), more.view().rows, more.values(),
-                                                 more.noise_of_values(more.noise().stddev()))) {
+    for (std::string& text : constraint_warnings(posterior, nullptr, log.name(), all.states(), all.view().rows, all.values(),
+                                                 all.noise_of_values(all.noise().stddev()))) {
       notes.push_back(std::move(text));
     }
-    note_unexpected(posterior, more, log, notes);
+    note_unexpected(posterior, more, rows, log, notes);
   } catch (const Error&) {
     // where the old mean of latents that are not linear has no motion, the new one may have
   }
@@ -468,6 +515,7 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   const double before = left_out(posterior);
   const auto n_before = static_cast<double>(posterior.n_states());
   const int n_more = more.n_data(), n_draws = posterior.n_components();
+  std::vector<LogFile> logs = counted_logs(fit, posterior);
   require_memory_of_more(posterior, more, log.name(), [] { return free_memory(); });
   const std::string reason = n_more > 0 && posterior.summary() ? reason_of_loss(posterior, more) : "";
   const FitPriorOptions before_range = fit.prior_options;
@@ -484,7 +532,8 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
   if (n_more > 0) fit.notes.reset();
   if (n_more > 0 && fit.report.inducing) fit.report.inducing->stretches.reset();  // they were of the data before
-  if (n_more > 0 && log.file()) fit.logs.push_back(*log.file());
+  if (n_more > 0) fit.logs = std::move(logs);
+  if (n_more > 0 && log.file()) fit.logs.emplace_back(*log.file()).n_learned = n_more;
   const bool is_last = (", " + fit.data_source).ends_with(", " + log.name());
   if (n_more > 0 && !is_last) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
   const double of_more = left_out(all) - before;
@@ -501,7 +550,11 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
 Posterior remove_oldest(Posterior&& posterior, FitFile& fit, int n) {
   std::vector<int> n_before;
   for (const Observations& group : posterior.observations()) n_before.push_back(group.n_data());
+  std::vector<LogFile> logs = counted_logs(fit, posterior);
   Posterior left = remove_oldest(std::move(posterior), n);
+  fit.logs = std::move(logs);
+  keep_logs_of_newest(fit, left.n_states());
+  if (n > 0) fit.notes.reset();
   std::vector<DistrustedValue>& distrusted = fit.report.distrusted;
   if (left.observations().size() != n_before.size()) {
     distrusted.clear();  // groups that are gone have given others their numbers
@@ -519,27 +572,12 @@ void make_room(Posterior& posterior, FitFile& fit, Observations& more, const Upd
   require_window(posterior, request);
   if (!request.window) return;
   if (more.n_data() > *request.window) more = more.slice(more.n_data() - *request.window, *request.window);
-  const std::int64_t n_old = posterior.n_states() + more.n_data() - *request.window;
-  if (n_old <= 0) return;
-  posterior = remove_oldest(std::move(posterior), fit, static_cast<int>(n_old));
-  fit.notes.reset();
+  leave_newest(posterior, fit, *request.window - more.n_data());
 }
 
 void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request) {
   require_window(posterior, request);
-  if (!request.window) return;
-  const std::int64_t n_old = posterior.n_states() - *request.window;
-  if (n_old > 0) {
-    posterior = remove_oldest(std::move(posterior), fit, static_cast<int>(n_old));
-    fit.notes.reset();
-  }
-  // logs of which nothing is left
-  auto oldest = fit.logs.end();
-  for (std::int64_t n_rows = 0; oldest != fit.logs.begin() && n_rows < *request.window;) n_rows += (--oldest)->rows;
-  if (oldest == fit.logs.begin()) return;
-  fit.logs.erase(fit.logs.begin(), oldest);
-  fit.data_source.clear();
-  for (const LogFile& log : fit.logs) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name;
+  if (request.window) leave_newest(posterior, fit, *request.window);
 }
 
 UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const UpdateRequest& request) {
@@ -564,6 +602,7 @@ UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const Updat
   keep_newest(posterior, fit, request);
   fit.take_data(posterior);
   outcome.n_states = posterior.n_states();
+  if (request.window) outcome.n_added = std::min(outcome.n_added, outcome.n_states);  // they are the newest
   outcome.fit = std::move(fit);
   return outcome;
 }

@@ -45,7 +45,9 @@ StateDifferences::StateDifferences(std::vector<StateDerivatives::Entry> entries)
 const MatrixXd& StateDifferences::states_around(const Ref<const VectorXd>& state) {
   states_ = state.replicate(1, column_above(moved_.size()));
   for (std::size_t m = 0; m < moved_.size(); ++m) {
-    const double h = relative_step * std::max(1.0, std::abs(state[moved_[m]]));
+    // balances the truncation, h², against the rounding of x, which is at least that of 1
+    const double rounding = std::numeric_limits<double>::epsilon() * std::max(1.0, std::abs(state[moved_[m]]));
+    const double h = std::max(std::cbrt(rounding), rounding);
     states_(moved_[m], column_above(m)) += h;
     states_(moved_[m], column_above(m) + 1) -= h;
   }

@@ -11,7 +11,7 @@
 
 namespace gp2 {
 
-/// Central differences, in the state, of numbers that only batches of states give: steps of h = ε^(1/3) max(1, |x_k|), so that
+/// Central differences, in the state, of numbers that only batches of states give: steps of h = (ε max(1, |x_k|))^(1/3), so that
 /// rounding and truncation are both about ε^(2/3).
 class StateDifferences {
  public:

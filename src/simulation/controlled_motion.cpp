@@ -131,13 +131,7 @@ VectorXd start_of(const Model& model) {
   const System& system = *model.system;
   const std::vector<std::string> names = system.state_names();
   VectorXd state = VectorXd::Zero(system.layout().size());
-  // quaternions of a robot start unturned
-  Eigen::Index next = 0;
-  for (const RobotDescription::Joint* joint :
-       model.robot ? model.robot->joints() : std::vector<const RobotDescription::Joint*>()) {
-    next += static_cast<Eigen::Index>(joint->coordinates().size());
-    if (joint->has_quaternion()) state[next - 4] = 1;
-  }
+  for (const int qw : quaternion_real_parts(model)) state[qw] = 1;
   for (int k = 0; k < 2 * system.nq(); ++k) {
     const auto start = model.motion->start.find(names[static_cast<std::size_t>(k)]);
     if (start != model.motion->start.end()) state[k] = start->second;
@@ -146,6 +140,17 @@ VectorXd start_of(const Model& model) {
 }
 
 }  // namespace
+
+std::vector<int> quaternion_real_parts(const Model& model) {
+  std::vector<int> entries;
+  int next = 0;
+  for (const RobotDescription::Joint* joint :
+       model.robot ? model.robot->joints() : std::vector<const RobotDescription::Joint*>()) {
+    next += static_cast<int>(joint->coordinates().size());
+    if (joint->has_quaternion()) entries.push_back(next - 4);
+  }
+  return entries;
+}
 
 DrivenMotion generate_motion(const Model& model, int n, RandomStream& random) {
   const System& system = *model.system;

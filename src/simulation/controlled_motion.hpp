@@ -1,5 +1,7 @@
 #pragma once
 
+#include <vector>
+
 #include "base/random.hpp"
 #include "gp2/model.hpp"
 
@@ -9,6 +11,9 @@ struct DrivenMotion {
   Eigen::MatrixXd states;         // (layout size × n)
   Eigen::MatrixXd accelerations;  // of its [truth] there; where dry friction holds a body those of rest (nq × n)
 };
+
+/// Entries of the state that are the real part, …_qw, of a quaternion of the model's robot: 1 where it is unturned.
+std::vector<int> quaternion_real_parts(const Model& model);
 
 /// n consecutive samples of a model's [motion]: its [truth] moves under a controller that knows its F only.
 ///

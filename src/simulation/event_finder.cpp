@@ -93,20 +93,30 @@ std::optional<double> EventFinder::find_dip(const DormandPrince& step, double st
   return std::nullopt;
 }
 
+VectorXd EventFinder::margins(const VectorXd& state) {
+  const VectorXd of_contacts = mode_.contacts.margins(state, rhs_.on_its_sides());
+  const VectorXd of_surfaces = mode_.switching.margins(state, rhs_.counted());
+  VectorXd out(of_contacts.size() + of_surfaces.size());
+  out << of_contacts, of_surfaces;
+  return out;
+}
+
+bool EventFinder::is_let_go_at(const PhasePoint& point) {
+  constexpr double rounding = 1e-9;
+  try {
+    return is_held() && (margins(rhs_.projected_state(point.x, point.t)).array() < -rounding).any();
+  } catch (const Error&) {
+    return false;
+  }
+}
+
 // The margins of what holds the motion are looked at at both ends and between.
 bool EventFinder::is_hold_unresolved(const DormandPrince& step, double smallest_step) {
   constexpr double rounding = 1e-6, shortest = 1e3;
   const double t = step.start().t, t_new = step.end().t;
-  if (!mode_.switching.is_sliding() && !mode_.contacts.is_any_closed()) return false;
+  if (!is_held()) return false;
   if (t_new - t <= shortest * smallest_step) return false;
-  const auto margins_at = [&](double time) {
-    const VectorXd state = rhs_.projected_state(step.at(time), time);
-    const VectorXd of_contacts = mode_.contacts.margins(state, rhs_.on_its_sides());
-    const VectorXd of_surfaces = mode_.switching.margins(state, rhs_.counted());
-    VectorXd margins(of_contacts.size() + of_surfaces.size());
-    margins << of_contacts, of_surfaces;
-    return margins;
-  };
+  const auto margins_at = [&](double time) { return margins(rhs_.projected_state(step.at(time), time)); };
   try {
     const VectorXd start = margins_at(t), middle = margins_at(std::midpoint(t, t_new)), end = margins_at(t_new);
     const VectorXd bend = (middle - (start + end) / 2).cwiseAbs(), least = start.cwiseMin(middle).cwiseMin(end);

@@ -24,6 +24,8 @@ class EventFinder {
   /// Whether a motion that is held may have been let go, and held again, within the step. What is held at rest has no error however long
   /// the step is, and forces of time may come and go in it.
   bool is_hold_unresolved(const DormandPrince& step, double smallest_step);
+  /// Whether what holds the motion would not hold it there, by more than rounding.
+  bool is_let_go_at(const PhasePoint& point);
 
  private:
   /// The motion at a time in the step.
@@ -36,6 +38,9 @@ class EventFinder {
   [[nodiscard]] std::vector<double> times_to_look_at(const DormandPrince& step, std::span<const double> written) const;
   bool has_left(const Place& at, bool may_be_let_go);
   bool is_let_go(Eigen::VectorXd state);
+  [[nodiscard]] bool is_held() const { return mode_.switching.is_sliding() || mode_.contacts.is_any_closed(); }
+  /// How far each contact and each surface is from letting the motion go.
+  Eigen::VectorXd margins(const Eigen::VectorXd& state);
   [[nodiscard]] std::optional<double> find_dip(const DormandPrince& step, double start, double end) const;
 
   RightHandSide& rhs_;

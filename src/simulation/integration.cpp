@@ -130,17 +130,20 @@ class Integration {
   }
 
   // The times before `end`, from the dense output of the step. False where its stages missed something: a force that acts for a few rows
-  // between them.
+  // between them, or that lets go what is held at its end again.
   bool write_before(double end) {
     constexpr std::size_t few = 3;  // rows that a step may well leave to its error estimate
+    const double start = step_.start().t;
     const Index first = recorder_.n_written();
     const std::span<const double> times = recorder_.times_before(end);
-    const bool may_miss = mode_.is_fixed() && times.size() >= few;
+    const bool may_miss = mode_.conditions.is_empty() && times.size() >= few;
+    const bool may_let_go = !limits_.is_at_once(end - start, start);
     for (const double t : times) {
       PhasePoint at{t, step_.at(t), {}};
       rhs_.project(at.x, t);
+      const bool is_let_go = may_let_go && events_.is_let_go_at(at);
       rhs_.evaluate(at);
-      if (may_miss && step_.is_missed(at)) {
+      if (is_let_go || (may_miss && step_.is_missed(at))) {
         recorder_.keep(first);
         return false;
       }

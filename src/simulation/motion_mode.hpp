@@ -12,9 +12,6 @@ struct MotionMode {
   Switching switching;
   Contacts contacts;
   ConditionalConstraints conditions;
-
-  /// Whether there is no other mode.
-  [[nodiscard]] bool is_fixed() const { return switching.is_empty() && contacts.is_empty() && conditions.is_empty(); }
 };
 
 }  // namespace gp2

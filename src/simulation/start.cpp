@@ -8,6 +8,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/simulate.hpp"
+#include "simulation/controlled_motion.hpp"
 #include "simulation/projection.hpp"
 
 namespace gp2 {
@@ -71,11 +72,19 @@ Nearest nearest_to(const System& system, const Eigen::VectorXd& parameters, cons
   return found;
 }
 
+// What is given stays as it is, and so does what the constraints do not read, though M may couple it to what moves.
+std::vector<bool> held_entries(const System& system, const StartingPoint& start) {
+  std::vector<bool> held = start.given;
+  const std::vector<bool> reads = system.reads(SystemPart::residuals);
+  for (std::size_t k = 0; k < held.size(); ++k) held[k] = held[k] || !reads[k];
+  return held;
+}
+
 // The nearest solution for the coordinates, with those that are given as they are, that Newton's method finds.
 // @throws NumericalError where it finds none
 Eigen::VectorXd solve_coordinates(const System& system, const Eigen::VectorXd& parameters, const StartingPoint& start) {
   const Eigen::Index nq = system.nq();
-  std::vector<bool> held = start.given;
+  std::vector<bool> held = held_entries(system, start);
   std::fill(held.begin() + nq, held.begin() + 2 * nq, false);
   // each is moved by another share of `aside`: equal ones may keep a symmetry that has no slope
   const auto solve_from = [&](double aside) {
@@ -124,7 +133,7 @@ Nearest solve_start(const System& system, const Eigen::VectorXd& parameters, con
   const Eigen::VectorXd at = found.projected;
   Eigen::VectorXd velocities;
   try {
-    std::vector<bool> held = start.given;
+    std::vector<bool> held = held_entries(system, start);
     std::fill(held.begin(), held.begin() + nq, true);
     found.projected = project_onto_constraints(system, parameters, at, held);
     velocities = found.projected;
@@ -152,6 +161,11 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
     const auto newton_start = model.newton_start.find(names[static_cast<std::size_t>(k)]);
     // an entry that is known from elsewhere is the better start
     if (newton_start != model.newton_start.end() && start.state[k] == 0) start.state[k] = newton_start->second;
+  }
+  for (const int qw : quaternion_real_parts(model)) {
+    const auto k = static_cast<std::size_t>(qw);
+    const bool is_open = !start.given[k] && start.state[qw] == 0 && !model.newton_start.contains(names[k]);
+    if (is_open && start.state.segment<3>(qw + 1).squaredNorm() < 1) start.state[qw] = 1;
   }
   const bool is_whole = open.empty();
   if (is_whole && system.residual_labels().empty()) return start.state;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 #include <utility>
 
 #include <Eigen/QR>
@@ -41,7 +42,9 @@ Switching::Switching(const SwitchingFunctions& functions, VectorXd parameters, S
       layout_(layout),
       tolerance_(tolerance),
       hold_(static_cast<std::size_t>(functions.size()), Hold::none),
+      first_united_(hold_.size()),
       toward_(VectorXd::Zero(functions.first().back())) {
+  std::iota(first_united_.begin(), first_united_.end(), 0);
   for (int k = 0; k < functions_.size(); ++k) toward_[first_of(k)] = 1;
 }
 
@@ -54,7 +57,7 @@ bool Switching::is_guided() const {
 std::vector<int> Switching::sliding() const {
   std::vector<int> surfaces;
   for (int k = 0; k < functions_.size(); ++k) {
-    if (hold(k) == Hold::rest) surfaces.push_back(k);
+    if (hold(k) == Hold::rest && first_united_[static_cast<std::size_t>(k)] == k) surfaces.push_back(k);
   }
   return surfaces;
 }
@@ -132,9 +135,14 @@ bool Switching::has_crossed(const VectorXd& state) const {
 void Switching::cross(const VectorXd& state) {
   constexpr double fast = 1e3;  // margins
   const Surfaces surfaces = surfaces_at(state);
+  const bool is_past_any = has_crossed(state);
   for (int k = 0; k < functions_.size(); ++k) {
     if (hold(k) == Hold::direction && part(surfaces.g, k).norm() > fast * surfaces.margin[k]) hold(k) = Hold::none;
-    if (!has_crossed(surfaces, k)) continue;
+    if (!has_crossed(surfaces, k)) {
+      // of surfaces that are one up to rounding one is found to be crossed first
+      if (is_past_any && hold(k) == Hold::none && part(surfaces.g, k).norm() <= surfaces.margin[k]) hold(k) = Hold::rest;
+      continue;
+    }
     const auto d = part(toward_, k);
     const auto g = part(surfaces.g, k);
     // it may have turned, beside a point, as it may not beside a line
@@ -157,8 +165,8 @@ void Switching::put(VectorXd& state) const {
   for (int k = 0; k < functions_.size(); ++k) {
     const double length = part(surfaces.g, k).norm();
     if (hold(k) == Hold::rest) part(toward, k).setZero();
-    // what creeps may be slower than the margin, beside which it is evaluated
-    if (hold(k) == Hold::direction) surfaces.margin[k] = 0;
+    // what creeps, or was let go, may be slower than the margin, beside which it is evaluated
+    if (hold(k) != Hold::rest) surfaces.margin[k] = 0;
     // those that hold nothing stay where they are
     if (hold(k) == Hold::none && length > 0) part(toward, k) = part(surfaces.g, k) / length;
   }
@@ -188,8 +196,11 @@ void Switching::settle(const VectorXd& state, const Acceleration& acceleration) 
     for (const int k : sliding()) {
       const double sigma = sigma_[next++];
       if (std::abs(sigma) <= 1) continue;
-      hold(k) = part(toward_, k).size() == 1 ? Hold::none : Hold::direction;
-      if (sigma < 0) part(toward_, k) *= -1;
+      for (int one = k; one < functions_.size(); ++one) {
+        if (first_united_[static_cast<std::size_t>(one)] != k) continue;
+        hold(one) = part(toward_, one).size() == 1 ? Hold::none : Hold::direction;
+        if (sigma < 0) part(toward_, one) *= -1;
+      }
       has_changed = true;
     }
   }
@@ -198,7 +209,11 @@ void Switching::settle(const VectorXd& state, const Acceleration& acceleration) 
 Switching::Values Switching::evaluate(const VectorXd& state, const Surfaces& surfaces, const Function& function) const {
   VectorXd toward = toward_;
   const std::vector<int> slid_on = sliding();
-  const auto flip = [&](std::size_t k) { part(toward, slid_on[k]) *= -1; };
+  const auto flip = [&](std::size_t k) {
+    for (int one = slid_on[k]; one < functions_.size(); ++one) {
+      if (first_united_[static_cast<std::size_t>(one)] == slid_on[k]) part(toward, one) *= -1;
+    }
+  };
   const auto value = [&] { return function(beside(state, surfaces, toward)); };
   const std::size_t n = slid_on.size();
   Values out;
@@ -268,9 +283,35 @@ MatrixXd Switching::slopes(const Values& values, const VectorXd& share) {
   return out;
 }
 
+// Rows of normals and of drift are compared along the velocities that the constraints allow.
+void Switching::unite(const VectorXd& state, const Surfaces& surfaces) {
+  constexpr double alike = 1e-6;  // rows of length 1
+  std::iota(first_united_.begin(), first_united_.end(), 0);
+  const std::vector<int> slid_on = sliding();
+  // points of a plane turn, each in its own direction
+  if (slid_on.size() < 2 || toward_.size() > functions_.size() || !surfaces.normals.allFinite()) return;
+  const MatrixXd T = tangent_ ? tangent_(state) : MatrixXd::Identity(layout_.nq, layout_.nq);
+  MatrixXd rows(functions_.size(), layout_.nq + 1);
+  rows << surfaces.normals * T, surfaces.drift;
+  for (std::size_t k = 0; k < slid_on.size(); ++k) {
+    auto row = rows.row(slid_on[k]);
+    const double length = row.head(layout_.nq).norm();
+    if (!(length > least_way_out * surfaces.normals.row(slid_on[k]).norm())) continue;
+    row /= length * toward_[slid_on[k]];
+    for (std::size_t other = 0; other < k; ++other) {
+      const int first = slid_on[other];
+      const double side = row.dot(rows.row(first)) < 0 ? -1 : 1;
+      if (first_united_[static_cast<std::size_t>(first)] != first || !((row - side * rows.row(first)).norm() <= alike)) continue;
+      first_united_[static_cast<std::size_t>(slid_on[k])] = first;
+      toward_[slid_on[k]] *= side;
+      break;
+    }
+  }
+}
+
 // ġ = drift + N f = 0 along `toward` for s = 1 − σ of each surface that is slid on: in one step of Newton's method where jumps add up,
 // as those of most forces do. A surface that would need s outside [0, 2] cannot hold the motion: s stays at the end of the range, and
-// the others are solved anew.
+// the others are solved anew. If the motion then goes to its other side, it is tried anew itself, once.
 VectorXd Switching::acceleration_along(const Surfaces& surfaces, const Values& values) {
   const std::vector<int> slid_on = sliding();
   const auto n = static_cast<Index>(slid_on.size());
@@ -287,6 +328,7 @@ VectorXd Switching::acceleration_along(const Surfaces& surfaces, const Values& v
   const MatrixXd gain = normals * values.jumps;
   const VectorXd rate = drift + normals * values.above;
   std::vector<int> open;
+  std::vector<bool> is_tried_anew(slid_on.size(), false);
   for (int k = 0; k < static_cast<int>(n); ++k) {
     if (gain(k, k) < 0) {
       open.push_back(k);
@@ -295,16 +337,18 @@ VectorXd Switching::acceleration_along(const Surfaces& surfaces, const Values& v
       sigma_[k] = rate[k] < 0 ? -2 : 2;
     }
   }
-  while (!open.empty()) {
+  while (true) {
     VectorXd solved = share_(open);
     constexpr int most_steps = 30;
     constexpr double enough = 1e-14, farthest = 4;
-    for (int step = 0; step < most_steps; ++step) {
+    for (int step = 0; step < most_steps && !open.empty(); ++step) {
       VectorXd share = share_;
       share(open) = solved;
       const VectorXd rest = (drift + normals * mixture(values, share))(open);
       const MatrixXd slope = (normals * slopes(values, share))(open, open);
-      const VectorXd change = least_solution(slope, rest);
+      // a force that is weak beside another is no rounding of it
+      const VectorXd lengths = slope.colwise().norm().transpose(), size = (lengths.array() > 0).select(lengths, 1.0);
+      const VectorXd change = least_solution(slope * size.cwiseInverse().asDiagonal(), rest).cwiseQuotient(size);
       solved += change;
       if (values.corners.size() == 0 || change.norm() <= enough) break;
       solved = solved.cwiseMax(-farthest).cwiseMin(2 + farthest);
@@ -318,7 +362,20 @@ VectorXd Switching::acceleration_along(const Surfaces& surfaces, const Values& v
     if (excess == 0) {
       share_(open) = solved;
       sigma_(open) = 1 - solved.array();
-      break;
+      const VectorXd left = drift + normals * mixture(values, share_);
+      int wrong = 0;
+      while (wrong < static_cast<int>(n) && (std::abs(sigma_[wrong]) <= 1 || is_tried_anew[static_cast<std::size_t>(wrong)] ||
+                                             !(left[wrong] * sigma_[wrong] < 0)))
+        ++wrong;
+      if (wrong == static_cast<int>(n)) break;
+      is_tried_anew[static_cast<std::size_t>(wrong)] = true;
+      if (gain(wrong, wrong) < 0) {
+        open.push_back(wrong);
+      } else {
+        share_[wrong] = 2 - share_[wrong];
+        sigma_[wrong] *= -1;
+      }
+      continue;
     }
     const int k = open[worst];
     constexpr double least = 1e-9;
@@ -418,6 +475,7 @@ bool Switching::turn_along(const VectorXd& state, const Surfaces& surfaces, cons
 VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acceleration) {
   constexpr int most_turns = 30;
   const Surfaces surfaces = surfaces_at(state);
+  unite(state, surfaces);
   const bool may_turn = is_guided() && toward_.size() > functions_.size();
   Turn turn;
   if (may_turn) turn.ways = ways_out(state, surfaces);

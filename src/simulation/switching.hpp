@@ -89,6 +89,9 @@ class Switching {
   /// −∂f/∂(1 − σ).
   static Eigen::MatrixXd slopes(const Values& values, const Eigen::VectorXd& share);
   Eigen::VectorXd acceleration_along(const Surfaces& surfaces, const Values& values);
+  /// Finds the surfaces slid on that are one along what the constraints allow, as those of two feet of a box that stands flat: no state
+  /// is on different sides of them, so that they act as one.
+  void unite(const Eigen::VectorXd& state, const Surfaces& surfaces);
   /// A search for directions: those there are, the last σd, its ġ, and ∂ġ/∂(σd).
   struct Turn {
     std::vector<Eigen::MatrixXd> ways;
@@ -98,6 +101,7 @@ class Switching {
   bool turn_along(const Eigen::VectorXd& state, const Surfaces& surfaces, const Values& values, const Eigen::VectorXd& ddq,
                   const Acceleration& acceleration, Turn& turn);
   std::vector<Eigen::MatrixXd> ways_out(const Eigen::VectorXd& state, const Surfaces& surfaces);
+  /// The surfaces slid on, of united ones the first.
   [[nodiscard]] std::vector<int> sliding() const;
   [[nodiscard]] Hold hold(int surface) const { return hold_[static_cast<std::size_t>(surface)]; }
   Hold& hold(int surface) { return hold_[static_cast<std::size_t>(surface)]; }
@@ -120,10 +124,11 @@ class Switching {
   double tolerance_;
   std::function<Eigen::MatrixXd(const Eigen::VectorXd&)> tangent_;
   std::function<void(Eigen::VectorXd&)> constraints_;
-  std::vector<Hold> hold_;  // of each surface
-  Eigen::VectorXd toward_;  // d of each surface, one after the other
-  Eigen::VectorXd share_;   // 1 − σ of each surface slid on, within [0, 2]
-  Eigen::VectorXd sigma_;   // beyond [−1, 1] where the surface does not hold the motion
+  std::vector<Hold> hold_;         // of each surface
+  std::vector<int> first_united_;  // with each surface, itself where there is no other
+  Eigen::VectorXd toward_;         // d of each surface, one after the other
+  Eigen::VectorXd share_;          // 1 − σ of each surface slid on, within [0, 2]
+  Eigen::VectorXd sigma_;          // beyond [−1, 1] where the surface does not hold the motion
 };
 
 }  // namespace gp2

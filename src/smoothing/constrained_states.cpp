@@ -179,7 +179,7 @@ ConstrainedStates::Linearisation ConstrainedStates::linearise(const VectorXd& st
   const Index nq = system_.nq(), nc = system_.nc();
   const auto n_position = static_cast<Index>(position_rows_.size()), n_velocity = static_cast<Index>(velocity_rows_.size());
   // central differences in q and dq, all in one batch
-  const VectorXd steps = 1e-6 * state.head(2 * nq).cwiseAbs().cwiseMax(1);
+  const VectorXd steps = (std::numeric_limits<double>::epsilon() * state.head(2 * nq).array().abs().max(1)).pow(1.0 / 3);
   MatrixXd states = state.replicate(1, 1 + 4 * nq);
   for (Index k = 0; k < 2 * nq; ++k) {
     states(k, 1 + 2 * k) += steps[k];

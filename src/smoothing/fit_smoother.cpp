@@ -223,6 +223,27 @@ void maximise(const std::vector<Measurement>& measurements, const Box& box, cons
   fit.noise_at_least = result.x[2] <= box.lower[2] + 1e-9;
 }
 
+/// Without a τ that the measurements do not need: at a speed that is nearly constant it stands for the noise as well as σ does.
+void leave_out_needless_time_noise(const std::vector<Measurement>& measurements, Box box, const std::atomic<bool>* stop,
+                                   SmootherFit& fit) {
+  constexpr double much = 2;      // of log likelihood, by one more parameter
+  constexpr double steady = 0.9;  // of the mean square, by the mean
+  const auto n = static_cast<double>(measurements.size());
+  double mean = 0, mean_square = 0;  // of speeds
+  for (const Measurement& one : measurements) {
+    mean += std::abs(one.rate) / n;
+    mean_square += square(one.rate) / n;
+  }
+  const bool is_steady = square(mean) > steady * mean_square;
+  if (fit.model.time_stddev == 0 || !(fit.noise_at_least || is_steady)) return;
+  SmootherFit without = fit;
+  without.model.noise_stddev = std::hypot(fit.model.noise_stddev, fit.model.time_stddev * std::sqrt(mean_square));
+  box.upper[4] = box.lower[4];
+  maximise(measurements, box, stop, without);
+  fit.evaluations = without.evaluations;
+  if (without.log_likelihood > fit.log_likelihood - much) fit = without;
+}
+
 /// Stretches of consecutive measurements, evenly spread, about so many in all.
 std::vector<Measurement> excerpt(const std::vector<Measurement>& measurements, std::size_t most) {
   if (measurements.size() <= most) return measurements;
@@ -489,6 +510,7 @@ SmootherFit fit_smoother(std::vector<Measurement> measurements, const SmootherFi
       // errors that are gone by the second round have led the first astray
       if (round < 2) search(some, box, rough, options, fit);
       maximise(some, box, options.stop, fit);
+      leave_out_needless_time_noise(some, box, options.stop, fit);
     }
     const Hindsight hindsight = hindsight_of(measurements, trust.used(), fit.model);
     fit.kurtosis = kurtosis_of(hindsight.sizes, trust.used());

@@ -9,6 +9,7 @@ namespace {
 
 using testing::AllOf;
 using testing::HasSubstr;
+using testing::Not;
 
 class BaselineCommand : public testing::Test {
  protected:
@@ -58,6 +59,15 @@ TEST_F(BaselineCommand, RefusesWhatOnlyMechanicsHas) {
   EXPECT_EQ(force.status, 2);
   EXPECT_THAT(force.err, HasSubstr("--view force: a baseline learns accelerations, not forces: ask for --view constrained"));
   EXPECT_FALSE(desk.has("force.csv"));
+}
+
+TEST_F(BaselineCommand, IsAdvisedOfNothingThatItRefusesOrDoesNotKnow) {
+  const auto notes_under = [&](const std::string& noise) {
+    return desk.done("gp2 fit models/surface.toml --data train.csv --baseline se --restarts 1 -o fit.json --noise-std " + noise)
+        .err;
+  };
+  EXPECT_THAT(notes_under("4"), AllOf(HasSubstr("as smoothed ones do"), Not(HasSubstr("--noise-std estimate"))));
+  EXPECT_THAT(notes_under("0.01"), AllOf(HasSubstr("not among the features"), Not(HasSubstr("a mass"))));
 }
 
 TEST_F(BaselineCommand, ASystemOfOtherFeaturesIsRefused) {

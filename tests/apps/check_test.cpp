@@ -136,6 +136,10 @@ TEST(Check, SaysWhichAccelerationsTheLogLacks) {
   const Outcome checked = desk.done("gp2 check models/surface.toml --data log.csv");
   EXPECT_THAT(checked.out, HasSubstr("not in the log: ddq2; fit with --observe"));
   EXPECT_THAT(checked.out, HasSubstr("columns not needed: vertical_comment"));
+  desk.done("cut -d, -f1-9 log.csv > states.csv");
+  const Outcome of_states = desk.done("gp2 check models/surface.toml --data states.csv");
+  EXPECT_THAT(of_states.out, HasSubstr("not in the log: ddq1, ddq2, ddq3; a fit needs at least one of them"));
+  EXPECT_THAT(of_states.out, Not(HasSubstr("for the others")));
 }
 
 /// A particle on a line with a changed mass matrix or constraint.

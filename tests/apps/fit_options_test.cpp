@@ -154,6 +154,7 @@ TEST_F(FitCommand, TellsOfTheHyperparametersThatItDrew) {
   const nlohmann::json& noise = draws.at("hyperparameters").back();
   EXPECT_EQ(noise.at("name"), "noise_stddev(ddq3)");
   EXPECT_THAT(desk.done("gp2 show fit.json").out, HasSubstr(fmt::format("(mean {:.6g}, ", noise.at("mean").get<double>())));
+  EXPECT_EQ(desk.done("gp2 show fit.json --json").json()["fit"]["stddev"]["noise_stddev(ddq3)"], noise.at("stddev"));
   EXPECT_FALSE(short_fit("").contains("draws"));
 }
 

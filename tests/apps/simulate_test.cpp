@@ -6,6 +6,7 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
+#include "gp2/jobs/simulate_job.hpp"
 
 namespace gp2::test {
 namespace {
@@ -238,6 +239,16 @@ TEST_F(SimulateFit, SaysWhenTheMotionLeavesTheData) {
   EXPECT_TRUE(outside.said("warning: the motion leaves the region of the data at t = 0: at its farthest")) << outside.err;
 }
 
+TEST(MotionNotes, NameTheSampleThatLeavesTheDataFirst) {
+  std::vector<SimulatedMotion> motions(3);
+  motions[1].uncertainty = MotionUncertainty{{}, Eigen::VectorXd::Ones(1), 0.41};
+  motions[2].uncertainty = MotionUncertainty{{}, Eigen::VectorXd::Ones(1), 0.4};
+  EXPECT_EQ(first_to_leave(motions), &motions[2]);
+  EXPECT_THAT(motion_notes(motions), ElementsAre(HasSubstr("sample 2 leaves the region of the data at t = 0.4:")));
+  motions.resize(1);
+  EXPECT_EQ(first_to_leave(motions), nullptr);
+}
+
 TEST_F(SimulateFit, AnEnsembleOfSamplesStaysOnTheConstraint) {
   const std::string command = "gp2 simulate fit.json " + figure_start + " --t-end 0.5 --dt 0.1 --samples 3 --json ";
   const auto report = desk.done(command + "--seed 4 -o a.csv").json();
@@ -443,6 +454,16 @@ TEST(SimulateModelCommand, AMovingSurfaceGivesEnergyInAnImpact) {
   const Outcome outcome = desk.done("gp2 simulate plate.toml --start z=0.5,dz=0 --t-end 0.4 --dt 0.1 -o motion.csv");
   EXPECT_TRUE(outcome.said(" J, as a surface that moves does")) << outcome.err;
   EXPECT_FALSE(outcome.said("a smaller restitution")) << outcome.err;
+}
+
+TEST(SimulateModelCommand, TellsTheTimesOfContactsByAClockToo) {
+  const Desk desk;
+  desk.write("floor.toml",
+             "coordinates = [\"z\"]\ninputs = [\"touch\"]\n[mechanics]\nmass = [[1]]\nforce = [\"-9.81\"]\n"
+             "[constraints]\nposition = [{ expr = \"z\", contact = \"touch\", restitution = 0.9 }]\n");
+  const Outcome outcome =
+      desk.done("gp2 simulate floor.toml --start z=0.5,dz=0 --t-start 1.7e9 --t-end 1700000000.4 --dt 0.1 -o motion.csv");
+  EXPECT_TRUE(outcome.said("the first event at t = 1700000000.3192")) << outcome.err;
 }
 
 TEST_F(SimulateFit, MapRefusesNamesThatNobodyHas) {

@@ -7,10 +7,12 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/derive.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/generate_job.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/report_job.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/simulate.hpp"
@@ -22,9 +24,11 @@ namespace {
 
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using testing::AllOf;
 using testing::Contains;
 using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::Not;
 
 const char* const both = R"({ name = "u", delay = 0.02, lag = 0.04 })";
 
@@ -186,6 +190,46 @@ TEST(CommandRecord, ATruthActsByItsOwnDelays) {
               HasSubstr("has other delays or lags than the fit, which keeps no commands"));
 }
 
+// In a log in milliseconds a delay in seconds is as good as none.
+TEST(CommandRecord, ADelayInSecondsIsNotTakenForOneInTheUnitOfTheTime) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
+  std::vector<CsvTable::Column> columns;
+  for (const std::string& name : log.header()) {
+    columns.push_back({name, {}});
+    for (int row = 0; row < log.n_rows(); ++row)
+      columns.back().numbers.push_back((name == "t" ? 1e3 : 1) * log.number(row, log.find(name)));
+  }
+  const CsvTable in_milliseconds = CsvTable::from_columns("log", std::move(columns));
+  const auto told = Contains(
+      HasSubstr("t counts 0.001 s, while delays and lags of inputs are in seconds (u.delay, u.lag): inputs act at a wrong time"));
+  const Model model = late_cart(both);
+
+  EXPECT_THAT(make_fit_problem(model, in_milliseconds, with_force()).notes, told);
+  EXPECT_THAT(make_fit_problem(model, log, with_force()).notes, Not(told));
+  EXPECT_THAT(make_fit_problem(model, in_milliseconds, {}).notes, Not(told)) << "nothing reads u";
+
+  FitRequest learn;
+  learn.model = model;
+  learn.logs = {{log}};
+  learn.problem.mean = Prior::Mean::force;
+  learn.hyperparameters = HyperparameterChoice::optimise;
+  learn.max_iterations = 0;
+  const FitOutcome fit = run_fit(prepare_fit(std::move(learn)));
+  EXPECT_THAT(evaluate(fit.file, fit.posterior, in_milliseconds, {}).notes, told);
+  EXPECT_THAT(evaluate(fit.file, fit.posterior, log, {}).notes, Not(told));
+  EXPECT_THAT(predict(fit.file, in_milliseconds, {}).notes, told);
+  EXPECT_THAT(predict(fit.file, log, {}).notes, Not(told));
+
+  const auto found_in = [&](const Model& of) {
+    std::vector<std::string> texts;
+    for (const Finding& one : check(of, &in_milliseconds, {})) texts.push_back(one.text);
+    return texts;
+  };
+  const auto harmless = Contains(HasSubstr("a fit does not mind"));
+  EXPECT_THAT(found_in(model), AllOf(told, Not(harmless)));
+  EXPECT_THAT(found_in(late_cart(R"("u")")), AllOf(harmless, Not(told)));
+}
+
 // A fit has found its delays and lags: what is predicted by it reaches back as far as these do, not as far as they might.
 TEST(CommandRecord, OfAFitReachesAsFarAsWhatWasFound) {
   const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
@@ -197,7 +241,8 @@ TEST(CommandRecord, OfAFitReachesAsFarAsWhatWasFound) {
   std::vector<int> tenth;
   for (int row = 0; row < log.n_rows(); row += 10) tenth.push_back(row);
   EXPECT_THAT(read_log_states(prior, view, model, log.take(tenth), {}).notes,
-              Contains(HasSubstr("rows are usually 0.1 s apart, inputs at most 0.06 s late")));
+              Contains(testing::AllOf(HasSubstr("rows are usually 0.1 s apart, inputs at most 0.06 s late"),
+                                      HasSubstr("give all of it, to a fit as `commands`"))));
 }
 
 TEST(CommandRecord, AnotherSystemSharesWhatItMarks) {

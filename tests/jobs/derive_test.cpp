@@ -451,6 +451,23 @@ TEST(Derive, WrappedAnglesAreUnwrapped) {
   for (Index i = 0; i < data.states.cols(); ++i) EXPECT_NEAR(data.states(1, i), 8, 0.01);
 }
 
+// all noise is that of the times
+TEST(Derive, NoiseOfTheTimesCountsForWhatIsToldOfTheNoise) {
+  RandomStream random(4);
+  const CsvTable log = cart_log(
+      [&](std::vector<Row>& rows) {
+        for (std::size_t k = 0; k < rows.size(); ++k) {
+          const double t = 0.01 * static_cast<double>(k) + 2e-4 * random.normal();
+          rows[k][1] = shortest(8 * t + 5 * std::sin(1.5 * t));
+        }
+      },
+      {"t", "q1"}, 1000);
+  const DerivedSeries series = derive(cart(), log).series[0];
+  EXPECT_NEAR(series.model.time_stddev, 2e-4, 4e-5);
+  EXPECT_FALSE(series.noise_unseen);
+  EXPECT_LT(series.bandwidth, 0.7 * bandwidth_of(series.model, 0.01));
+}
+
 TEST(Derive, AnAngleThatIsOffByHalfATurnOnceIsAnOutlier) {
   for (const double turn : {std::numbers::pi, -std::numbers::pi}) {
     const DerivedData data =
@@ -602,6 +619,12 @@ TEST(Derive, WrongAndMissingValuesOfAnInputAreSaid) {
               Contains(HasSubstr("single values of the input u1 lie far from all "
                                  "others: 500 at row 78")));
   EXPECT_THAT(notes_of([](auto& rows) {
+                rows.insert(rows.begin() + 78, Row{rows[77][0], "", "500"});
+                rows[77][2] = "";
+              }),
+              Contains(HasSubstr("others: 500 at row 79")))
+      << "the second row of one time";
+  EXPECT_THAT(notes_of([](auto& rows) {
                 for (std::size_t k = 120; k < rows.size(); ++k) rows[k][2] = "";
               }),
               Contains(HasSubstr("warning: log.csv: the input u1 has no value for 0.8 s, from t = 1.19 on")));
@@ -631,6 +654,25 @@ TEST(Derive, ColumnsThatAreNotReadAreNamed) {
                                       {"t", "q1", "w1", "mark"}),
                                   {.keep = {"mark"}});
   EXPECT_THAT(data.notes, Contains("log.csv: columns not needed: w1"));
+}
+
+TEST(Derive, WhatIsKeptMayStandInRowsOfItsOwn) {
+  const DerivedData data = derive(cart(),
+                                  cart_log(
+                                      [](std::vector<Row>& rows) {
+                                        std::vector<Row> joined;
+                                        for (const Row& row : rows) {
+                                          joined.push_back({row[0], row[1], ""});
+                                          joined.push_back({row[0], "", row[0] + " s"});
+                                        }
+                                        rows = joined;
+                                      },
+                                      {"t", "q1", "mark"}),
+                                  {.keep = {"mark"}});
+  ASSERT_EQ(data.kept[0].size(), 200U);
+  EXPECT_EQ(data.kept[0][0], "0 s");
+  EXPECT_EQ(data.kept[0][150], "1.5 s");
+  EXPECT_EQ(data.lines[150], 302);
 }
 
 TEST(Derive, InputsGoThroughTheFilterOfThePositions) {
@@ -699,6 +741,10 @@ TEST(Derive, AShortEpisodeTakesTheModelOfTheOthers) {
   EXPECT_FALSE(data.series[0].shared_model);
   EXPECT_TRUE(data.series[1].shared_model);
   EXPECT_EQ(data.series[1].model.lengthscale, data.series[0].model.lengthscale);
+  // whatever column names the episodes, other commands read `episode`
+  const CsvTable table = as_table(data, *cart().system, "");
+  EXPECT_EQ(table.header().front(), "episode");
+  EXPECT_EQ(table.cell(180, 0), "short");
 }
 
 TEST(Derive, LikeAnotherLogItGoesThroughTheSameFilter) {

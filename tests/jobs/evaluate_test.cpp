@@ -79,7 +79,8 @@ TEST(EvaluateJob, ComparesAllThatAnyLogObservedAndSaysWhatItLeavesOut) {
 
   EvaluateOutcome outcome = evaluate(fit.file, posterior, log_of("test.csv", 9, ",ddx,ddy,ddheading", false), {});
   EXPECT_THAT(outcome.evaluation.outputs, ElementsAre("ddx", "ddheading"));
-  EXPECT_THAT(outcome.notes, Contains(HasSubstr("test.csv: not compared: ddy, which the fit did not observe")));
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr("test.csv: not compared: ddy, which the fit did not observe; `outputs` of an "
+                                                "evaluation chooses others")));
 
   outcome = evaluate(fit.file, posterior, log_of("test.csv", 9, ",ddheading", false), {});
   EXPECT_THAT(outcome.evaluation.outputs, ElementsAre("ddheading"));

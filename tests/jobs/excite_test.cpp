@@ -93,6 +93,33 @@ u1    = [-0.05, 0.05]
 start = { q2 = 0, q3 = 0.3 }
 )toml";
 
+/// A driven puck that falls onto a hill.
+constexpr const char* puck = R"toml(
+name        = "puck"
+coordinates = ["x", "z"]
+inputs      = ["touch", "f"]
+[parameters]
+m = { value = 0.2, bounds = [0.1, 0.4], estimate = true }
+[mechanics]
+mass  = [["m", "0"], ["0", "m"]]
+force = ["f", "-9.81*m"]
+[constraints]
+position = [{ expr = "z - 0.3*cos(3*x)", contact = "touch", restitution = 0.4 }]
+[[latent]]
+name       = "friction"
+features   = ["dx", "dz"]
+directions = "force"
+[noise]
+ddq = 0.05
+[truth]
+force = ["-0.05*dx", "-0.05*dz"]
+[sampling]
+x     = [-2, 2]
+dx    = [-2.5, 2.5]
+f     = [-1, 1]
+touch = [0.9, 1]
+)toml";
+
 FitOutcome fit_to(const Model& model, std::vector<Log> logs, bool estimate = true) {
   FitRequest request;
   request.model = model;
@@ -314,6 +341,24 @@ TEST(Excitation, IsWhatSimulateMakesOfItsInputs) {
   const FitSystem system{&bench.model, bench.model.actuators, nullptr, bench.fit.posterior.prior()};
   const Trajectory motion = run_simulation(prepare_simulation(system, bench.fit.posterior, request)).front();
   EXPECT_LT((motion.states - found.motion.states).cwiseAbs().maxCoeff(), 1e-6);
+}
+
+TEST(Excitation, NeedsNoLimitsOfAContact) {
+  ExciteRequest request;
+  request.start = std::map<std::string, double>{{"x", 0.2}, {"z", 1}};
+  request.duration = 1;
+  request.n_rows = 60;
+  request.n_motions = 40;
+  request.inputs_within = {{"f", {-1, 1}}};
+  const Bench bench = make_bench(puck, 60, request);
+  const Excitation found = bench.excite(bench.request);
+  ASSERT_EQ(found.limits.size(), 1U);
+  EXPECT_EQ(found.limits[0].name, "f");
+  EXPECT_GT(found.limits[0].share, 0.5);
+  EXPECT_LE(found.motion.commands.row(1).cwiseAbs().maxCoeff(), 1);
+  request.inputs_within["touch"] = {0, 1};
+  EXPECT_EQ(test::input_error_of([&] { bench.excite(request); }),
+            "`inputs_within`: 'touch' is a contact, which the motion makes: leave it out");
 }
 
 TEST(Excitation, AskedToStopEndsWithTheBestSoFar) {

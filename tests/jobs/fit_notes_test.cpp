@@ -139,6 +139,24 @@ TEST(FitNotes, TellOfALatentThatTheConstraintsTakeUp) {
   }
 }
 
+TEST(FitNotes, TellNothingOfTheCoordinateThatAConstraintHolds) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0,3,0,5,0\n2,0,1,0,1,0\n0.5,0,2,0,2,0\n", "log.csv");
+  const auto told = [&](const std::string& directions) {
+    const Model model = Model::parse(
+        "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '2']]\nforce = ['0', '-9.81']\n[constraints]\n"
+        "position = ['y']\n[[latent]]\nname = 'drag'\nfeatures = ['dx']\ndirections = " +
+            directions + "\n",
+        "rail");
+    FitProblemOptions options;
+    options.noise_stddev = 0.1;
+    return make_fit_problem(model, log, options).notes;
+  };
+  EXPECT_THAT(told("'force'"), Not(Contains(HasSubstr("take it up"))));
+  EXPECT_THAT(
+      told("{ force = [['1', '0'], ['0', '1']] }"),
+      Contains(HasSubstr("warning: latent 'drag', direction 2, acts along the constraints, which take it up, at all of 3")));
+}
+
 // What a latent reads of the load of the constraints may be none, or a choice.
 TEST(FitNotes, TellOfALatentThatActsNowhereAndOfLoadsThatAreShared) {
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,0,3,0,5,0.1\n2,0,4,0,6,0\n3,0,5,0,6,-0.1\n", "log.csv");
@@ -434,6 +452,11 @@ TEST(FitNotes, NameCausesThatTheModelCanHave) {
   EXPECT_THAT(causes("inputs = ['u']\n", "force"), HasSubstr("an input that is clipped"));
   EXPECT_THAT(causes("", "force"), HasSubstr("a clock that is not that of the samples"));
   EXPECT_THAT(causes("", "potential"), HasSubstr("a force that dissipates, which a potential does not"));
+  Prior baseline = prior_of_cart("", "acceleration");
+  baseline.reference = baseline.system;
+  EXPECT_THAT(
+      note_of(scores_of(0.01, 0.011, 0.2, 0.9, 100), baseline),
+      ElementsAre(AllOf(HasSubstr("(something that acts and is not among the features, a clock"), Not(HasSubstr("mass")))));
 }
 
 TrainingResidual residual_of(int n, double rms, double coverage95) {
@@ -463,6 +486,8 @@ TEST(FitNotes, TellWhereResidualsThatLastAreMoreThanNoise) {
   EXPECT_EQ(correlated_text({one, one}), correlated_text({one})) << "of two short logs, which tell together";
   one.rms_in_noise = 3.9;
   EXPECT_THAT(correlated_text({one}), AllOf(HasSubstr("ddy (0.75)"), HasSubstr("3.9 times the noise: a mass, a length")));
+  EXPECT_THAT(correlated_text({one}, /*is_of_baseline=*/true),
+              HasSubstr("3.9 times the noise: something acts that is not among the features"));
   EXPECT_TRUE(last_beyond_noise({one}));
 }
 

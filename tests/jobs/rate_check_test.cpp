@@ -412,7 +412,7 @@ TEST(FarValues, AreThoseFarBeyondAllOthers) {
   // of values that are some of a log's, in another order
   std::vector<int> lines(300);
   for (int k = 0; k < 300; ++k) lines[static_cast<std::size_t>(k)] = 2 + 3 * (299 - k);
-  EXPECT_THAT(far_values_text("u", {values}, {lines}).value(), testing::HasSubstr(": 1e+06 at row 148. "));
+  EXPECT_THAT(far_values_text("u", {values}, {lines}).value(), testing::HasSubstr(": 1e+06 at line 149. "));
   RowVectorXd pulses = RowVectorXd::Zero(300);
   pulses[12] = 50;
   EXPECT_THAT(far_values(pulses), IsEmpty()) << "an input that rests but for a pulse";

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <functional>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -247,6 +248,74 @@ FitRequest request_of_slider(const std::string& constraints = "") {
                                  "[[latent]]\nfeatures = ['x', 'dx']\ndirections = 'force'\n",
                              "slider");
   return asked;
+}
+
+// Of each time there are two rows, the first without a position.
+TEST(LearnedLog, ItsFitNamesLinesOfTheRawLogAndListsItsFile) {
+  const CsvTable log = slider_log("x");
+  std::string text = "t,x\n";
+  for (int i = 0; i < log.n_rows(); ++i) text += fmt::format("{0},\n{0},{1}\n", log.cell(i, 0), log.cell(i, 1));
+  const TemporaryFolder folder;
+  const CsvTable raw = CsvTable::read(folder.write("raw.csv", text));
+  const FitRequest asked = request_of_slider();
+  for (const bool windows : {true, false}) {
+    const LearnedLog learned = learn_and_smooth(asked, raw, {.most_passes = 0, .windows = windows});
+    const FitJob job = prepare_raw_fit(learned, asked, "raw.csv");
+    ASSERT_EQ(job.problem.lines.front().size(), learned.rows.size());
+    const auto smoothed = prepare_fit(learned.request(asked, "raw.csv")).problem.lines.front();
+    for (std::size_t i = 0; i < smoothed.size(); ++i) EXPECT_EQ(job.problem.lines.front()[i], 2 * smoothed[i] - 2);
+    ASSERT_THAT(job.file.logs, testing::SizeIs(1));
+    EXPECT_TRUE(job.file.has_learned(*raw.file()));
+  }
+}
+
+TEST(LearnedLog, KeepsNamesOfColumnsOfSideInformation) {
+  FitRequest asked = request_of_slider();
+  asked.problem.columns = {{"x", "place"}};
+  const auto job_of = [&](const CsvTable& log) {
+    const LearnedLog learned = learn_and_smooth(asked, log, {.most_passes = 0, .windows = false});
+    return prepare_raw_fit(learned, asked, "log");
+  };
+  EXPECT_NO_THROW(job_of(slider_log("place")));
+  asked.problem.also_noise_stddev = 0.1;
+  asked.also = {{View::Quantity::unconstrained_acceleration, "", {CsvTable::parse("place,dplace,abar_x\n0.1,0,0\n", "rest")}}};
+  for (const char* name : {"place", "x"}) {
+    const FitProblem problem = job_of(slider_log(name)).problem;
+    ASSERT_THAT(problem.observations, testing::SizeIs(2)) << name;
+    EXPECT_EQ(problem.observations.back().states()(0, 0), 0.1) << name;
+  }
+  asked.problem.columns = {{"x", "nowhere"}};
+  EXPECT_THAT(input_error_of([&] { job_of(slider_log("x")); }), HasSubstr("has no column 'nowhere'"));
+}
+
+// whose times begin anew, which matters where inputs act late
+TEST(LearnAndSmooth, TakesEpisodesOfAColumnOfAnotherName) {
+  FitRequest asked;
+  asked.model = Model::parse(
+      "coordinates = ['x']\ninputs = [{ name = 'u', delay = 0.02 }]\n[mechanics]\nmass = [[1]]\nforce = ['u']\n"
+      "[[latent]]\nfeatures = ['dx']\ndirections = 'force'\n",
+      "slider");
+  asked.problem.mean = Prior::Mean::force;
+  const CsvTable one = slider_log("x", {{"u", [](double t) { return -2 * std::sin(2 * (t + 0.02)); }}});
+  std::vector<std::string> cells;
+  for (const char* run : {"A", "B"}) {
+    for (int i = 0; i < one.n_rows(); ++i) cells.insert(cells.end(), {run, one.cell(i, 0), one.cell(i, 1), one.cell(i, 2)});
+  }
+  RawFitOptions options{.most_passes = 0, .windows = false};
+  options.derive.episode_column = "run";
+  const LearnedLog learned = learn_and_smooth(asked, CsvTable::from_cells("log", {"run", "t", "x", "u"}, cells), options);
+  EXPECT_NO_THROW(prepare_raw_fit(learned, asked, "log"));
+}
+
+TEST(LearnAndSmooth, PaperProtocolRefusesSeveralLatentsByItsOwnName) {
+  FitRequest asked = request_of_slider();
+  asked.model = Model::parse(
+      "coordinates = ['x']\n[mechanics]\nmass = [[1]]\n[[latent]]\nname = 'a'\nfeatures = ['x']\ndirections = 'force'\n"
+      "[[latent]]\nname = 'b'\nfeatures = ['dx']\ndirections = 'force'\n",
+      "slider");
+  asked.problem.protocol.name = Protocol::Name::paper;
+  EXPECT_THAT(input_error_of([&] { learn_and_smooth(asked, slider_log("x"), {.most_passes = 1}); }),
+              HasSubstr("`protocol=paper` has one latent"));
 }
 
 TEST(LearnAndSmooth, LearnsFromRowsWhereVelocitiesAreLoggedUnderAnotherName) {

@@ -1,4 +1,5 @@
 // Data that deny the model are not believed without a word, and data that do not are.
+#include <atomic>
 #include <map>
 #include <numeric>
 
@@ -107,6 +108,19 @@ TEST(Residuals, TellOfAColumnInAnotherUnit) {
   EXPECT_THAT(notes_of_fit(data), Contains(HasSubstr(of_constraint)));
 }
 
+TEST(Residuals, OfAConstraintNameTheLogAndTheLinesOfItsFile) {
+  const Data sound = data_of("models/surface.toml", 16);
+  Data wrong = data_of("models/surface.toml", 17);
+  wrong.accelerations(2, 17) += 100;
+  std::string text = wrong.table().text();
+  text.insert(text.find('\n') + 1, "\n\n");  // lines that are no rows
+  FitRequest request = fit_request(*sound.model, {sound.table(), CsvTable::parse(text, "wrong.csv")});
+  request.max_iterations = 60;
+  EXPECT_THAT(notes_of(run_fit(prepare_fit(std::move(request))).notes, of_constraint),
+              testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: log 2: measured ddq on A ddq = b"),
+                                                  HasSubstr("of 60 rows (farthest off: line 21): outliers"))));
+}
+
 // a motion whose measured accelerations have errors that last
 struct LastingErrors {
   static constexpr double noise = 0.1;
@@ -122,13 +136,17 @@ struct LastingErrors {
       if (i >= 0) data.accelerations.col(i) = truth.col(i) + error;
     }
   }
-  [[nodiscard]] FitOutcome fit(bool thin) const { return fit(data.table(), thin); }
-  [[nodiscard]] FitOutcome fit(CsvTable table, bool thin) const {
+  [[nodiscard]] FitRequest request(CsvTable table) const {
     FitRequest request = fit_request(*data.model, {std::move(table)});
     request.problem.noise_stddev = noise;
     request.problem.estimate = std::vector<std::string>();
-    request.thin = thin;
-    return run_fit(prepare_fit(std::move(request)));
+    return request;
+  }
+  [[nodiscard]] FitOutcome fit(bool thin) const { return fit(data.table(), thin); }
+  [[nodiscard]] FitOutcome fit(CsvTable table, bool thin) const {
+    FitRequest of_table = request(std::move(table));
+    of_table.thin = thin;
+    return run_fit(prepare_fit(std::move(of_table)));
   }
   [[nodiscard]] double coverage(const FitOutcome& outcome) const {
     const Posterior::Marginal prediction =
@@ -148,12 +166,50 @@ TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
   EXPECT_LE(n_rows(fewer), 75);
   EXPECT_GE(n_rows(fewer), 40);
   EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted to {} of 300, evenly spaced", n_rows(fewer)))));
+  // 300/40 rows apart they are still correlated by about 0.9^7
+  EXPECT_THAT(fewer.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals are correlated from row to row"),
+                                                   HasSubstr("their residuals are still correlated by 0."))));
   EXPECT_LT(log.coverage(all), 0.8);
   EXPECT_GT(log.coverage(fewer), 0.85);
   // the same fit again, from its own file
   const FitOutcome again = run_fit(prepare_fit_again(fewer.file));
   EXPECT_EQ(n_rows(again), n_rows(fewer));
   EXPECT_EQ(again.file.report.objective, fewer.file.report.objective);
+}
+
+TEST(Residuals, OfAFitThatStartsBeyondTheBoundsOfFewerRowsAreFittedToThoseToo) {
+  const LastingErrors log(300, 0.9);
+  FitRequest request = log.request(log.data.table());
+  request.max_iterations = 30;
+  request.hyperparameters = HyperparameterChoice::optimise;
+  const std::vector<Hyperparameter> of_all = prepare_fit(request).problem.hyperparameters;
+  const auto lengthscale =
+      std::ranges::find_if(of_all, [](const Hyperparameter& h) { return h.name.starts_with("lengthscale"); });
+  // fewer rows spread less or more, so that one of the bounds of all is beyond theirs
+  for (const double bound : {lengthscale->lower, lengthscale->upper}) {
+    FitRequest started = request;
+    started.start.values[lengthscale->name] = bound;
+    const FitOutcome fewer = run_fit(prepare_fit(std::move(started)));
+    EXPECT_LT(n_rows(fewer), 300);
+    EXPECT_THAT(fewer.notes, Not(Contains(HasSubstr("failed"))));
+  }
+}
+
+TEST(Residuals, OfAllRowsStayWhereTheFitToFewerIsStopped) {
+  const LastingErrors log(300, 0.9);
+  FitRequest request = log.request(log.data.table());
+  request.hyperparameters = HyperparameterChoice::optimise;
+  std::atomic<bool> stop = false;
+  double seconds = 0;
+  const auto stop_second = [&](const Progress& one) {
+    if (one.seconds < seconds) stop = true;
+    seconds = one.seconds;
+  };
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)), stop_second, &stop);
+  EXPECT_TRUE(stop);
+  EXPECT_EQ(n_rows(outcome), 300);
+  EXPECT_EQ(outcome.file.report.termination, FitReport::interrupted);
+  EXPECT_FALSE(outcome.file.report.converged);
 }
 
 TEST(Residuals, OfAShuffledLogAreTakenInTheOrderOfItsTime) {
@@ -170,9 +226,7 @@ TEST(Residuals, OfAShuffledLogAreTakenInTheOrderOfItsTime) {
 // rows chosen at random stay in the order of the log, so that it shows that they share their errors
 TEST(Residuals, OfRowsChosenAtRandomAreTakenInTheOrderOfTheLog) {
   const LastingErrors log(300, 0.95);
-  FitRequest request = fit_request(*log.data.model, {log.data.table()});
-  request.problem.noise_stddev = LastingErrors::noise;
-  request.problem.estimate = std::vector<std::string>();
+  FitRequest request = log.request(log.data.table());
   request.problem.max_points = 200;
   const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
   EXPECT_THAT(outcome.notes, Contains(HasSubstr("residuals are correlated from row to row")));
@@ -537,14 +591,18 @@ TEST(Residuals, OfARobustFitLeaveOutWhatItDistrusts) {
 TEST(Residuals, TellOfNoiseThatIsStatedTooLarge) {
   const Driven driven;
   const Data data = driven.data(46);
-  const auto notes_under = [&](double noise) {
+  const auto notes_under = [&](double noise, Protocol::Name protocol = Protocol::Name::standard) {
     FitRequest request = fit_request(driven.model, {data.table()});
     request.problem.noise_stddev = noise;
+    request.problem.protocol.name = protocol;
     return notes_of(run_fit(prepare_fit(std::move(request))).notes, "than the stated noise");
   };
   EXPECT_THAT(notes_under(0.05), testing::IsEmpty());
   EXPECT_THAT(notes_under(0.05 * 0.2), testing::IsEmpty());
-  EXPECT_THAT(notes_under(0.05 * 5), testing::ElementsAre(testing::ContainsRegex("ddx \\(0.[1-4][0-9]* of the noise\\), ddy")));
+  EXPECT_THAT(notes_under(0.05 * 5),
+              testing::ElementsAre(testing::AllOf(testing::ContainsRegex("ddx \\(0.[1-4][0-9]* of the noise\\), ddy"),
+                                                  testing::EndsWith("; `noise_std=estimate` finds it"))));
+  EXPECT_THAT(notes_under(0.05 * 5, Protocol::Name::paper), testing::ElementsAre(testing::EndsWith("as smoothed ones do")));
 }
 
 TEST(Residuals, TellOfAnInputThatIsWrongInOneOfSeveralLogs) {
@@ -703,7 +761,7 @@ TEST(Residuals, NameSingleValuesOfAnInput) {
   data.states(driven.row_of(0), 17) = 1e6;
   EXPECT_THAT(notes_of(notes_of_fit(data), "the input "),
               testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: single values of the input u lie far"),
-                                                  HasSubstr(": 1e+06 at row 18. Correct them"))));
+                                                  HasSubstr(": 1e+06 at line 19. Correct them"))));
 }
 
 TEST(Residuals, TellOfRowsThatStandInTwoLogs) {

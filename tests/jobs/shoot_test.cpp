@@ -143,6 +143,7 @@ TEST(Shoot, FindsParametersFromWhichTheMotionComes) {
   const FitFile& shot = out.fit;
   EXPECT_EQ(shot.posterior().values().parameters[0], out.parameters[0].value);
   EXPECT_FALSE(shot.report.draws.has_value());
+  EXPECT_EQ(shot.report.termination, "parameters by multiple shooting, of a fit that ended so: " + fit.report.termination);
 }
 
 TEST(Shoot, WhatIsWrittenOfAFitThroughInducingPointsStandsForTheNewParameters) {
@@ -355,6 +356,8 @@ TEST(Shoot, SaysWhatIsWrong) {
                 shoot(fit, CsvTable::from_cells("short.csv", {"t", "q"}, {"0", "1"}));
               }),
               HasSubstr("short.csv: missing column"));
+  EXPECT_THAT(input_error_of([&] { shoot(fit, with_column_off(log, "t", 1e3, 0)); }),
+              HasSubstr("wrong.csv: the rates of the coordinates say that t counts 0.001 s, not seconds"));
   FitFile known = fit;
   std::erase_if(known.report.hyperparameters, [](const Hyperparameter& one) { return one.is_system_parameter(); });
   EXPECT_THAT(input_error_of([&] { shoot(known, log); }), HasSubstr("the fit of 'swing' estimates no parameter of the system"));

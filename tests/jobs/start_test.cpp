@@ -240,6 +240,30 @@ TEST(StartOfALog, OfRoundedCoordinatesSolvesForTheOthersNearThem) {
   EXPECT_THAT(job.notes, Contains(HasSubstr("; the nearest that has one is x = 0.789")));
 }
 
+// s is in no constraint, though M couples it to x; at the centre of the circle Newton's method has no slope.
+TEST(StartByNames, LeavesWhatNoConstraintReadsAtZero) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["s", "x", "z"]
+[mechanics]
+mass  = [["2", "0.5", "0"], ["0.5", "1", "0"], ["0", "0", "1"]]
+force = ["0", "0", "-9.81"]
+[constraints]
+position = ["x^2 + z^2 - 1"]
+)toml",
+                                   "circle.toml");
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.1);
+  request.start = std::map<std::string, double>{{"ds", 0.5}};
+  const VectorXd from_centre = prepare_simulation(model, request).start;
+  EXPECT_EQ(from_centre[0], 0);
+  EXPECT_NEAR(from_centre.segment(1, 2).norm(), 1, 1e-14);
+  request.start = std::map<std::string, double>{{"x", 0.6}, {"dz", 0.3}};
+  const VectorXd moving = prepare_simulation(model, request).start;
+  EXPECT_EQ(moving[0], 0);
+  EXPECT_EQ(moving[3], 0);
+  EXPECT_NEAR(moving[1] * moving[4] + moving[2] * 0.3, 0, 1e-14);
+}
+
 // z = 0, which is taken where it is not given, may be inside the hill
 TEST(StartByNames, IsOnTheSurfaceThatItWouldBeBelow) {
   const Model model = Model::parse(R"toml(

@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <filesystem>
+#include <functional>
 #include <string>
 #include <vector>
 
@@ -11,9 +13,11 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "base/not_a_number.hpp"
 #include "data_of_model.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "inference/problems.hpp"
 #include "input_error.hpp"
 #include "io_testing.hpp"
@@ -111,7 +115,7 @@ TEST(UpdateJob, AWindowLearnsNoRowsThatItLeavesBehind) {
   UpdateRequest request;
   request.window = 20;
   const UpdateOutcome updated = update(fit, {log_of(5, 3), log}, request);
-  EXPECT_EQ(updated.n_added, 20'005);
+  EXPECT_EQ(updated.n_added, 20) << "that are there then";
   EXPECT_EQ(updated.n_states, 20);
   ASSERT_EQ(updated.fit.observations.size(), 1U);
   EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(20));
@@ -137,6 +141,56 @@ TEST(UpdateJob, MoreRowsThanMemoryHoldsAreRefusedWithThoseThatFit) {
   EXPECT_THAT(refused(1e12, false), HasSubstr(" GB more memory in one piece, which the system does not give"));
 }
 
+using Cell = std::function<double(int row, const std::string& column, double value)>;
+
+// The log with the numbers of some columns as `cell` has them, 1 before in those that it lacks; NaN: an empty cell.
+CsvTable with_cells(const CsvTable& log, std::vector<std::string> names, const Cell& cell) {
+  std::vector<CsvTable::Column> columns;
+  for (const std::string& name : names) {
+    columns.push_back({name, {}});
+    const int column = log.find(name);
+    for (int row = 0; row < log.n_rows(); ++row)
+      columns.back().numbers.push_back(cell(row, name, column < 0 ? 1 : log.number(row, column)));
+  }
+  return CsvTable::from_columns("more.csv", std::move(columns));
+}
+
+TEST(UpdateJob, SaysAndRefusesOfEmptyCellsWhatAFitDoes) {
+  const FitFile fit = fit_of(log_of(30, 1));
+  const CsvTable log = log_of(10, 2);
+  std::vector<std::string> names = log.header();
+  names.emplace_back("ddq1_std");
+  const auto emptied = [&](const std::function<bool(int row, const std::string& column)>& is_empty) {
+    return with_cells(log, names, [&](int row, const std::string& column, double value) {
+      if (is_empty(row, column)) return not_a_number;
+      return column == "ddq1_std" ? 0.05 : value;
+    });
+  };
+  const auto is_value = [](const std::string& column) { return column.starts_with("ddq") && !column.ends_with("_std"); };
+  const UpdateOutcome some = update(fit, {emptied([&](int row, const std::string& column) {
+                                      return column == "ddq1_std" ? row < 5 : is_value(column) && row == 9;
+                                    })},
+                                    {});
+  EXPECT_EQ(some.n_added, 9);
+  EXPECT_THAT(some.notes,
+              Contains("more.csv: values not measured (empty cells): 6 of 10 of ddq1 (5 without a standard deviation), "
+                       "1 of 10 of ddq2, 1 of 10 of ddq3"));
+  EXPECT_THAT(some.notes, Contains("more.csv: 1 rows left out: they have no measured value"));
+  const CsvTable none = emptied([](int, const std::string& column) { return column == "ddq1_std"; });
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(update(fit, {none}, {})); }),
+            "more.csv: column 'ddq1_std': every cell is empty, so nothing is measured there; leave the column out");
+  UpdateRequest told;
+  told.noise_stddev = 0.05;
+  std::vector<std::string> notes;
+  EXPECT_EQ(more_observations(fit, fit.posterior(), none, told, notes).values(), more_of(fit, log).values())
+      << "the column is not read then";
+  const CsvTable never = emptied([&](int row, const std::string& column) {
+    return column == "ddq1_std" ? row > 0 : is_value(column) && (column != "ddq1" || row == 0);
+  });
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(update(fit, {never}, {})); }),
+              HasSubstr("no row has a value and, where the log has a column for it, its standard deviation"));
+}
+
 // A stream of rows, some without a value of one column.
 TEST(UpdateJob, ARowMayLackAValueOfAColumn) {
   const FitFile fit = fit_of(log_of(30, 1));
@@ -158,7 +212,7 @@ TEST(UpdateJob, ARowMayLackAValueOfAColumn) {
   EXPECT_EQ(some[2], all[2]);
   const UpdateOutcome updated = update(fit, {without({"ddq2"})}, {});
   EXPECT_EQ(updated.n_states, 31);
-  EXPECT_THAT(updated.notes, testing::Not(Contains(HasSubstr("ddq2"))));
+  EXPECT_THAT(updated.notes, Contains("row.csv: values not measured (empty cells): 1 of 1 of ddq2"));
   const UpdateOutcome nothing = update(fit, {without({"ddq1", "ddq2", "ddq3"})}, {});
   EXPECT_EQ(nothing.n_states, 30);
   EXPECT_THAT(nothing.notes, Contains(HasSubstr("warning: row.csv: nothing is learned from it")));
@@ -266,15 +320,76 @@ TEST(UpdateJob, SaysWhichValuesCannotBe) {
   constexpr const char *cannot_be = "of the values contradict the fit", *are_far = "rows are far from the fit's data";
   for (const int n : {1, 5, 40}) {
     EXPECT_THAT(notes_of(n, "", 1, 0, 1), testing::Not(Contains(HasSubstr("warning")))) << n;
-    EXPECT_THAT(notes_of(n, "ddq3", n, 500, 1),
-                Contains(testing::AllOf(HasSubstr("warning: next: 1 of the values"), HasSubstr(cannot_be),
-                                        HasSubstr("(ddq3, at row 1 of what is learned from it)"))))
+    EXPECT_THAT(notes_of(n, "ddq3", n, 500, 1), Contains(testing::AllOf(HasSubstr("warning: next: 1 of the values"),
+                                                                        HasSubstr(cannot_be), HasSubstr("(ddq3, at row 1)"))))
         << n;
   }
   EXPECT_THAT(notes_of(5, "ddq1", 1, 0, -1), Contains(HasSubstr(cannot_be)));
   EXPECT_THAT(notes_of(40, "ddq1", 8, 100, 1), Contains(HasSubstr("5 of the values")));
   EXPECT_THAT(notes_of(40, "dq1", 1, 0, 1000),
               Contains(testing::AllOf(HasSubstr("warning: next: 40 of 40"), HasSubstr(are_far))));
+}
+
+TEST(UpdateJob, NamesRowsOfTheLogWhereSomeAreLeftOut) {
+  const FitFile fit = fit_of(log_of(60, 1));
+  const CsvTable log = log_of(50, 2);
+  const CsvTable wrong = with_cells(log, log.header(), [](int row, const std::string& column, double value) {
+    if (!column.starts_with("ddq")) return value;
+    return row < 10 ? not_a_number : value + (column == "ddq1" && (row == 30 || row == 40) ? 1000 : 0);
+  });
+  const auto note_with = [](const std::vector<std::string>& notes, const std::string& text) {
+    const auto found = std::ranges::find_if(notes, [&](const std::string& note) { return note.find(text) != std::string::npos; });
+    return found == notes.end() ? "" : *found;
+  };
+  const std::vector<std::string> notes = update(fit, {wrong}, {}).notes;
+  const std::string farthest = note_with(notes, "farthest off");
+  EXPECT_THAT(farthest, testing::AnyOf(HasSubstr("2 of 40 rows (farthest off: row 41, 31)"),
+                                       HasSubstr("2 of 40 rows (farthest off: row 31, 41)")));
+  EXPECT_EQ(note_with(evaluate(fit, fit.posterior(), wrong, {}).notes, "farthest off"), farthest);
+  EXPECT_THAT(note_with(notes, "contradict the fit"),
+              testing::AnyOf(HasSubstr("(ddq1, at row 31)"), HasSubstr("(ddq1, at row 41)")));
+}
+
+// A log of many rows, of which the fit took few, has none left when as many as these are newer.
+TEST(UpdateJob, AWindowStrikesTheLogsOfWhichNothingIsLeft) {
+  const test::TemporaryFolder folder;
+  const auto file_of = [&](const std::string& name, int n, std::uint64_t seed) {
+    log_of(n, seed).write(folder / name);
+    return CsvTable::read(folder / name);
+  };
+  FitRequest request = test::fit_request(test::model(surface), {file_of("a.csv", 50, 1), file_of("b.csv", 60, 2)});
+  request.max_iterations = 0;
+  request.problem.max_points = 10;
+  FitFile fit = run_fit(prepare_fit(std::move(request))).file;
+  const auto names_under = [&](int window, const std::string& name, std::uint64_t seed) {
+    UpdateRequest newest;
+    newest.window = window;
+    fit = update(std::move(fit), {file_of(name, 10, seed)}, newest).fit;
+    fit.write(folder / "fit.json");
+    fit = FitFile::read(folder / "fit.json");
+    std::vector<std::string> names;
+    for (const LogFile& log : fit.logs) names.push_back(std::filesystem::path(log.name).filename());
+    return names;
+  };
+  EXPECT_THAT(names_under(25, "c.csv", 3), testing::ElementsAre("a.csv", "b.csv", "c.csv"));
+  EXPECT_THAT(names_under(25, "d.csv", 4), testing::ElementsAre("b.csv", "c.csv", "d.csv"));
+  EXPECT_THAT(names_under(20, "e.csv", 5), testing::ElementsAre("d.csv", "e.csv"));
+  EXPECT_EQ(fit.logs.front().n_learned, 10);
+  // files had no such numbers before: a log stays until others have as many rows
+  for (LogFile& log : fit.logs) log.n_learned.reset();
+  EXPECT_THAT(names_under(15, "f.csv", 6), testing::ElementsAre("d.csv", "e.csv", "f.csv"));
+  EXPECT_THAT(names_under(20, "g.csv", 7), testing::ElementsAre("f.csv", "g.csv"));
+}
+
+TEST(UpdateJob, AFitToWindowsOfARawLogTakesNoWindow) {
+  FitFile fit = fit_of(log_of(30, 1));
+  const Observations& all = fit.observations.front();
+  fit.observations = {all.with_sums({{0, 0, Eigen::VectorXd::Ones(1), all.values()(0, 0), Eigen::VectorXd::Ones(1)}})};
+  UpdateRequest newest;
+  newest.window = 1000;
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(update(fit, {log_of(3, 2)}, newest)); }),
+            "`window`: the fit learned from windows of a raw log, of which single rows cannot be taken away; fit the newest logs "
+            "again, or this one with `windows=none`");
 }
 
 TEST(UpdateJob, WhatCannotBeIsAnError) {

@@ -265,6 +265,20 @@ position = ['0.1*cos(a) + 0.3*cos(b) - c', '0.1*sin(a) + 0.3*sin(b)']
   }
 }
 
+TEST(Check, AConstraintThatIsFasterThanItsCoordinatesIsFollowedToo) {
+  const Model model = Model::parse(
+      "coordinates = ['x', 'z']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n[constraints]\nposition = ['z - "
+      "1e-5*sin(3000*x)']\n",
+      "a stylus on a grating");
+  MatrixXd states(5, 50);
+  for (Eigen::Index i = 0; i < states.cols(); ++i) {
+    const double x = 0.02 * static_cast<double>(i);
+    states.col(i) << x, 1e-5 * std::sin(3000 * x), 1, 3e-2 * std::cos(3000 * x), 0;
+  }
+  const Finding finding = motion_finding(*model.system, states);
+  EXPECT_EQ(finding.level, Finding::Level::good) << finding.text;
+}
+
 TEST(Check, ATimeOfAClockIsSteppedAsItRounds) {
   const Model model = Model::parse(
       "coordinates = ['x']\n[parameters]\nw = 3\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = ['x - sin(w*t)']\n",
@@ -357,6 +371,29 @@ struct NoisyBead {
     return {Finding::Level::error, "not looked at"};
   }
 };
+
+// Where the known force presses nothing noise decides which of the states pull.
+TEST(Check, AContactThatPullsAtMoreThanHalfOfTheStatesMayDoSoByChance) {
+  const Model model = Model::parse(R"(
+coordinates = ["x", "z"]
+inputs = ["touch"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+)",
+                                   "a slide");
+  MatrixXd states = MatrixXd::Zero(6, 60);
+  states.row(5).setOnes();
+  for (const int n_pulling : {36, 50}) {
+    MatrixXd ddq = MatrixXd::Ones(2, 60);
+    ddq.row(1).head(n_pulling).setConstant(-1);
+    const std::string text =
+        all_of(check_data(*model.system, states, model.system->parameter_values(), ddq, MatrixXd::Ones(2, 60)));
+    EXPECT_THAT(text, HasSubstr(std::to_string(n_pulling) + " of 60 states where it is closed"));
+    EXPECT_EQ(text.find("a contact only pushes") != std::string::npos, n_pulling == 50) << text;
+  }
+}
 
 TEST(Check, ANoiseThatIsNotGivenIsNotKnown) {
   const NoisyBead bead;

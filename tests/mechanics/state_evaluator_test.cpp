@@ -241,6 +241,19 @@ TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
   }
 }
 
+TEST(StateEvaluatorTest, DifferencesSuitAnAngleOfManyTurnsAndTheTimeOfAClock) {
+  const Model model =
+      Model::parse("coordinates = ['x']\n[mechanics]\nmass = [['1']]\nforce = ['sin(x) + sin(3*t)']\n", "a driven wheel");
+  const OpaqueSystem opaque(*model.system);
+  const auto exact = model.system->make_evaluator(VectorXd(), true), differences = opaque.make_evaluator(VectorXd(), true);
+  const Eigen::Vector3d state(1e5, 1, 1.7e9);
+  exact->evaluate(state);
+  differences->evaluate(state);
+  const MatrixXd jacobian = jacobian_of(*exact, *model.system);
+  EXPECT_GT(jacobian.cwiseAbs().maxCoeff(), 0.5);
+  EXPECT_LE((jacobian_of(*differences, opaque) - jacobian).cwiseAbs().maxCoeff(), 1e-3);
+}
+
 TEST(StateEvaluatorTest, WhereASpeedHasNoDerivativeItIsZero) {
   const Model model = Model::parse(R"toml(
 name = "two coordinates"

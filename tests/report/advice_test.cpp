@@ -1,4 +1,5 @@
 #include <limits>
+#include <utility>
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -68,10 +69,14 @@ TEST(Advice, TellsWhereAConstraintLetsGo) {
   report.data = {good_data("training"), good_data("test")};
   report.data[1].states = Eigen::MatrixXd::Zero(7, 50);
   report.data[1].lower_rank = {2, 1, {3, 8}};
+  EXPECT_THAT(
+      learning_advice(report),
+      ElementsAre(advises(Level::warning,
+                          "rank 2 but at 2 of 50 states of the test data, where it is as low as 1, first at row 4 of test",
+                          "dead centre")));
+  report.data[0].lower_rank = std::exchange(report.data[1].lower_rank, {});
   EXPECT_THAT(learning_advice(report),
-              ElementsAre(advises(Level::warning,
-                                  "rank 2 but at 2 of 50 states of the test data, where it is as low as 1, first at row 4",
-                                  "dead centre")));
+              ElementsAre(advises(Level::warning, "first at row 4 of the rows that training kept", "dead centre")));
 }
 
 TEST(Advice, TellsThatTheOptimiserDidNotConverge) {
@@ -208,7 +213,7 @@ TEST(Advice, TellsOfDataOffTheConstraintByHowFarTheyAre) {
   report.data[1].violation = ConstraintViolation{1e-3, 1e-3, 1e-3, 5, "q1 - q2"};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "of the training and test data", "")));
   EXPECT_THAT(learning_advice(report),
-              ElementsAre(advises(Level::warning, "row 4 of training: q1 - q2 = 1e-09, 0.3", "`estimate`")));
+              ElementsAre(advises(Level::warning, "row 4 of the rows that training kept: q1 - q2 = 1e-09, 0.3", "`estimate`")));
 }
 
 TEST(Advice, TellsOfColumnsThatFollowFromEachOther) {

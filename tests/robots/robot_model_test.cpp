@@ -134,6 +134,24 @@ TEST(Motion, OfAFreeBodyReachesItsTargetsWithAQuaternionOfLengthOne) {
   EXPECT_NEAR(value_of(model, "body('drone').rot_xz", data.states.col(59)), 0.3, 5e-3);
 }
 
+TEST(Start, OfAFreeBodyIsUnturnedWhereNothingIsSaid) {
+  const Model model = read_drone(drone);
+  const auto size = model.system->layout().size();
+  StartingPoint start{VectorXd::Zero(size), std::vector<bool>(static_cast<std::size_t>(size), false)};
+  std::vector<std::string> notes;
+  start.state[2] = 1;
+  start.given[2] = true;
+  const VectorXd unturned = complete_start(model, model.system->parameter_values(), start, notes);
+  EXPECT_EQ(unturned.head(7), VectorXd::Unit(7, 2) + VectorXd::Unit(7, 3));
+  EXPECT_TRUE(notes.empty()) << notes.front();
+  start.state[4] = 0.6;
+  start.given[4] = true;
+  const VectorXd turned = complete_start(model, model.system->parameter_values(), start, notes);
+  EXPECT_NEAR(turned[3], 0.8, 1e-14);
+  EXPECT_EQ(turned.segment(5, 2), VectorXd::Zero(2));
+  EXPECT_EQ(turned.head(2), VectorXd::Zero(2));
+}
+
 TEST(Motion, OfAFreeBodyIsByForcesAlongItsAxes) {
   const auto message = [](const std::string& more) {
     return test::input_error_of([&] { read_drone("robot = 'drone.xml'\n" + more); });

@@ -336,6 +336,22 @@ position = [{ expr = "z", contact = "touch" }]
   }
 }
 
+TEST(Contact, AtRestIsLetGoByAPulseOverAFewRows) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1"]]
+force = ["-9.81 + 60*exp(-((t - 3.7)/0.3)^2)"]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+)toml",
+                                   "pulse");
+  const std::vector<ContactEvent> released = of_kind(motion_of(model, {0, 0}, 10, 101), Kind::released);
+  ASSERT_EQ(released.size(), 1U);
+  EXPECT_NEAR(released[0].time, 3.7 - 0.3 * std::sqrt(std::log(60 / g)), of_event);
+}
+
 TEST(Contact, HoldsForAnHour) {
   // driven to and fro over hills that are too flat to leave
   const Model model = Model::parse(R"toml(
@@ -750,6 +766,19 @@ TEST(ContactFriction, OfTwoFeetBringsABoxToRest) {
     const Trajectory motion = motion_of(model, {0, 0.2, 0, v, 0, 0}, 5, 6, 1e-10);
     ASSERT_EQ(motion.states.cols(), 6);
     EXPECT_NEAR(motion.states(0, 5), v * std::abs(v) / (2 * 0.1 * g), 1e-7) << v;
+  }
+}
+
+// Both feet stick and stay, whichever of them rounding brings to rest first.
+TEST(ContactFriction, OfTwoFeetHoldsABoxAtRest) {
+  for (const double mu : {0.3, 0.4, 0.6}) {
+    const Trajectory motion = motion_of(box(mu, true), {0, 0.2, 0, 1.5, 0, 0}, 5, 101);
+    ASSERT_EQ(motion.states.cols(), 101) << mu;
+    EXPECT_NEAR(motion.states(0, 100), 1.5 * 1.5 / (2 * mu * g), 1e-7) << mu;
+    EXPECT_NEAR(motion.accelerations(0, 100), 0, 1e-9) << mu;
+    ASSERT_EQ(motion.sticks.size(), 2U) << mu << ", once each foot";
+    for (const StickEvent& stick : motion.sticks) EXPECT_TRUE(stick.sticks) << mu;
+    EXPECT_LT(motion.steps, 100) << mu;
   }
 }
 

@@ -255,6 +255,32 @@ TEST(SimulateDryFriction, LetsABodyGoWhenTheForceIsLargeEnough) {
   }
 }
 
+TEST(SimulateDryFriction, LetsABodyGoByAPulseOverAFewRows) {
+  const Model model = bodies({"x"}, {"-4.905*sign(dx) + 60*exp(-((t - 3.7)/0.1)^2)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {{"x", 0}}), with_tolerance(times(10, 101), 1e-8));
+  ASSERT_EQ(out.sticks.size(), 2U);
+  EXPECT_NEAR(out.sticks[0].time, 3.7 - 0.1 * std::sqrt(std::log(60 / 4.905)), 1e-6);
+  EXPECT_GT(out.states(0, 100), 9);
+}
+
+// A body that turns on while one friction holds it crosses the surface of another, be that as weak as can be.
+TEST(SimulateDryFriction, HoldsABodyWhileAnotherChangesItsSide) {
+  for (const double c : {0.0, 1e-6, 0.5}) {
+    const std::string stuck = "9*sign(dx + 0.3*da)", weak = fmt::format("{}*sign(dx + 0.35*da)", c);
+    const Model model = Model::parse(fmt::format("coordinates = [\"x\", \"a\"]\n[mechanics]\nmass = [[1, 0], [0, 0.05]]\n"
+                                                 "force = [\"-{0} - {1}\", \"1 - 0.3*{0} - 0.35*{1}\"]\n",
+                                                 stuck, weak),
+                                     "two frictions");
+    const Trajectory out =
+        simulate_switching(model, state_of(model, {{"dx", 0.09}, {"da", -0.3}}), with_tolerance(times(0.5, 6), 1e-8));
+    ASSERT_EQ(out.states.cols(), 6) << c;
+    EXPECT_LT(out.steps, 100) << c;
+    for (int i = 0; i < 6; ++i) EXPECT_NEAR(out.states(2, i) + 0.3 * out.states(3, i), 0, 1e-10) << c;
+    // (0.05 + 0.3²) ä = 1, less c
+    EXPECT_NEAR(out.states(3, 5), -0.3 + 0.5 / 0.14, c < 0.1 ? 1e-4 : 1) << c;
+  }
+}
+
 TEST(SimulateDryFriction, TwoBodiesMoveAsOneUntilOneIsTornOff) {
   // friction between both; the first is slowed by the ground as well, until it rests while the second slides on
   const Model model = bodies({"x", "y"}, {"-sign(dx - dy) - 0.5*sign(dx)", "sign(dx - dy)"});

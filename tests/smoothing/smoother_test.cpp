@@ -268,6 +268,20 @@ TEST(Smoother, FindsTheNoiseWhereEveryPositionIsMeasuredTwiceAtItsTime) {
   }
 }
 
+TEST(Smoother, TakesNoiseForNoTimingWhereASpeedIsNearlyConstant) {
+  for (const std::uint64_t seed : {1, 2, 3}) {
+    RandomStream random(seed);
+    std::vector<Measurement> measurements;
+    for (int k = 0; k < 1000; ++k) {
+      const double t = 0.01 * k;
+      measurements.push_back({t, 50 * t + 0.3 * std::sin(3 * t) + 1e-3 * random.normal()});
+    }
+    const SmootherFit fit = fit_smoother(measurements);
+    EXPECT_NEAR(fit.model.noise_stddev, 1e-3, 1e-4) << seed;
+    EXPECT_FALSE(fit.noise_at_least) << seed;
+  }
+}
+
 TEST(Smoother, TakesFastPlacesOfAMotionForNoTiming) {
   // bursts between which it hardly moves, a few samples each
   std::vector<Measurement> measurements;

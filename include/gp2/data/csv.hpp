@@ -24,6 +24,8 @@ struct LogFile {
   std::uint64_t bytes = 0;
   std::int64_t rows = 0;
   std::string checksum = {};  // CRC-64 of xz, 16 hexadecimal digits
+  /// Rows that are in the fit whose log this is; not given: not known.
+  std::optional<std::int64_t> n_learned = {};
 };
 
 /// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Columns are kept as

@@ -72,6 +72,7 @@ struct DerivedData {
 
   std::vector<std::string> episodes;  // what the column says, once for each part between pauses; empty texts without a column
   std::vector<int> episode;           // of each row (N)
+  std::vector<int> lines;             // in the log, of the first row at the time of each row (N); empty at an even rate
   Eigen::MatrixXd states;             // [q; dq; t; u] (layout size × N), u as commanded, NaN where unknown
   Eigen::MatrixXd accelerations;      // ddq (nq × N), NaN where unknown
   Eigen::MatrixXd stddev;             // of q, dq, ddq (3 nq × N), NaN where not measured
@@ -82,7 +83,7 @@ struct DerivedData {
   std::vector<DerivedSeries> series;  // coordinate by coordinate, episode by episode
   std::vector<std::string> kept_names;
   std::vector<std::vector<std::string>> kept;  // cells of each kept column (N)
-  std::string episode_column;                  // its name; empty without one
+  std::string episode_column;                  // its name in the log; empty without one
   std::vector<std::string> notes;              // what a person should know; what may be wrong begins with "warning: "
 };
 
@@ -119,7 +120,7 @@ struct LearnedAccelerations {
 /// @throws InputError also for other options `rate` and `every`.
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const LearnedAccelerations& learned);
 
-/// Columns: the episode where there is one, t, q, dq, u, ddq as far as known, NAME_std of what was measured (of accelerations:
+/// Columns: `episode` where there is one, t, q, dq, u, ddq as far as known, NAME_std of what was measured (of accelerations:
 /// of independent ones), what is kept.
 /// @param name  stands for the table in messages
 CsvTable as_table(const DerivedData& data, const System& system, std::string name);

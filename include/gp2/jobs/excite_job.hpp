@@ -36,7 +36,7 @@ using Limits = std::map<std::string, std::pair<double, double>>;
 struct ExciteRequest {
   MotionStart start;
   double duration = 0;   // [s]
-  Limits inputs_within;  // of every input
+  Limits inputs_within;  // of every input that drives the model
   Limits within;         // of coordinates, velocities and accelerations; those that have none may go anywhere
 
   ExcitationTarget target = ExcitationTarget::automatic;

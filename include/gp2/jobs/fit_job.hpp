@@ -68,7 +68,6 @@ struct FitJob {
   FitFile file;  // all but the observations and the report
   std::vector<std::string> notes;
   bool thin = true;
-  bool has_wrong_rate = false;              // a column of a log is not the rate of another
   std::vector<ActuatorEstimate> actuators;  // that were estimated already
   std::filesystem::path checkpoint;         // of the request
   std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less
@@ -88,7 +87,8 @@ FitJob prepare_fit(FitRequest request);
 /// @throws InputError when the file does not say what was asked: those before format 6 do not.
 FitRequest request_of(const FitFile& fit);
 
-/// A fit again, from the data that are in its file: the same bits, on the same machine.
+/// A fit again, from the data that are in its file: the same bits, on the same machine. Its start values were given for the data that
+/// it was asked for; where those of the file give narrower bounds, it starts at the nearest.
 /// @param threads  as FitRequest
 /// @throws InputError as request_of, for robust fits, whose data are marked by the first one, and where the file has but some of them.
 FitJob prepare_fit_again(const FitFile& fit, int threads = 0);

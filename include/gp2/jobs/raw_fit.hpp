@@ -33,11 +33,16 @@ struct LearnedLog {
   std::shared_ptr<const Windows> windows;  // null: the rows themselves are learned from
   std::vector<double> gains;  // of each pass that was kept: log likelihood of the positions, beside a smoothing without a model
   std::vector<std::string> notes;
+  std::vector<LogFile> files = {};  // the raw log, if it is a file, and those that the smoothed one was written to
 
   /// The request of a fit to it, from that which it was learned for.
   /// @param name  of the log
   [[nodiscard]] FitRequest request(FitRequest asked, const std::string& name) const;
 };
+
+/// The fit to it, ready to run: as prepare_fit of LearnedLog::request, but its messages name lines of the raw log, of rows at one time
+/// the first, and its file lists `files`.
+FitJob prepare_raw_fit(const LearnedLog& log, FitRequest asked, const std::string& name);
 
 /// Rows that are learned from, and states that windows are over, where the request does not say how many
 /// (FitProblemOptions::max_points).

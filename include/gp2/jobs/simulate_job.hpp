@@ -40,6 +40,9 @@ struct SimulateRequest {
 };
 std::vector<Option> options(SimulateRequest& request);
 
+/// Inputs that drive a model: all but those of contacts, which the motion itself tells.
+std::vector<std::string> driving_inputs(const Model& model);
+
 /// The time of a log's first row; nothing where it has none.
 std::optional<double> start_time(const Model& model, const MotionStart& start, const std::map<std::string, std::string>& columns);
 
@@ -102,8 +105,11 @@ struct SimulatedMotion {
   std::optional<MotionEnergy> energy = {};            // of a model with a potential
 };
 
-/// Warnings of where motions leave the region of the data, where a constraint moves them at once, and where their constraints lose
-/// rank: of each what the first of them does.
+/// The motion that leaves the region of the data at the earliest time; null where none leaves it.
+const SimulatedMotion* first_to_leave(const std::vector<SimulatedMotion>& motions);
+
+/// Warnings of where motions leave the region of the data, of the one that does so earliest, and of where a constraint moves them at
+/// once, and where their constraints lose rank, of the first that does.
 std::vector<std::string> motion_notes(const std::vector<SimulatedMotion>& motions);
 
 }  // namespace gp2

@@ -46,20 +46,22 @@ void require_memory_of_more(const Posterior& posterior, const Observations& more
 /// @throws InputError as require_memory_of_more; NumericalError as update().
 Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
-/// remove_oldest() of a posterior and its fit, whose report keeps the distrusted values among what is left.
+/// remove_oldest() of a posterior and its fit, whose report keeps the distrusted values among what is left. Logs of which nothing is left
+/// are struck from the fit.
 Posterior remove_oldest(Posterior&& posterior, FitFile& fit, int n);
 
 /// Before more observations are added: what a window leaves behind goes, of what was learned and of what is added.
 /// @throws InputError as keep_newest.
 void make_room(Posterior& posterior, FitFile& fit, Observations& more, const UpdateRequest& request);
 
-/// Leaves the newest states that a window asks for, and the names of the logs that they are of, by the rows of these.
-/// @throws InputError as remove_oldest, and for a window that is not positive or of a fit through inducing points.
+/// Leaves the newest states that a window asks for, and the logs that they are of.
+/// @throws InputError as remove_oldest, and for a window that is not positive, or of a fit through inducing points or to windows of a raw
+///   log.
 void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request);
 
 struct UpdateOutcome {
   FitFile fit;
-  std::int64_t n_added = 0, n_states = 0;  // states: of the logs, and of the fit then
+  std::int64_t n_added = 0, n_states = 0;  // states: of the logs as far as they are in the fit then, and of the fit
   std::vector<std::string> notes;
 };
 

@@ -20,7 +20,8 @@ namespace gp2 GP2_API {
 /// last is not asked at a state where an entry that the part reads is not finite itself ("not measured"), nor of `evaluate` at
 /// parameters that are not the model's own: a fit that strays there meets the likelihood +∞, as with a model given as text.
 ///
-/// Derivatives in the state are those of StateEvaluator for any System: central differences.
+/// Derivatives in the state are those of StateEvaluator for any System: central differences over h = (ε max(1, |x_k|))^(1/3), about
+/// 6e-6, which suits units in which the x_k are of size one.
 class CallableSystem final : public System {
  public:
   using States = Eigen::Ref<const Eigen::MatrixXd>;      // (layout().size() × N)

@@ -103,7 +103,7 @@
     const rows = report.observations.reduce((sum, group) => sum + group.n, 0);
     byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}${report.date ? `; file of ${report.date}` : ""}.`;
     const tiles = [["Optimiser", fit.converged ? "converged" : fit.iterations === 0 ? "did not run" : "not converged", `${fit.iterations} iterations, best of ${fit.restarts.length} restarts`],
-      ["Negative log likelihood", format(fit.nll), fit.rows_are_those_of_fit ? `of ${rows} rows` : "at the fit; rows may have changed since"]];
+      ["Negative log likelihood", format(fit.nll), fit.rows_are_those_of_fit ? `of ${rows} rows` : "at the last fit or shoot; rows may have changed since"]];
     const shown = test || report.data[0];
     if (shown) {
       const e = shown.figures;
@@ -172,7 +172,7 @@
     const again = fit.restarts[fit.best_restart];
     byId("optimiser-lead").textContent = `${fit.termination.charAt(0).toUpperCase()}${fit.termination.slice(1)}, after ${fit.iterations} iterations. ` +
       `Negative log likelihood ${format(fit.nll)}; with hyper-priors, the objective, ${format(fit.objective)}.` +
-      (fit.rows_are_those_of_fit ? "" : " Both are those at the fit; rows may have been added or taken away since.") +
+      (fit.rows_are_those_of_fit ? "" : " Both are those at the last fit or shoot; rows may have been added or taken away since.") +
       (again && again.objective !== null && again.objective - fit.objective > 1e-9 * Math.abs(fit.objective) ? " A scan from the best restart found a lower optimum than the restarts." : "") +
       (fit.draws ? ` Predictions mix ${fit.draws.n} draws of the hyperparameters by ${fit.draws.n_chains} chains: R̂ at most ${format(fit.draws.r_hat, 3)}, worth ${format(fit.draws.effective_size, 3)} independent ones or more.` : "");
     byId("restarts").append(table("Restarts of the optimiser", [{ label: "restart" }, { label: "objective", number: true }, { label: "neg. log likelihood", number: true }, { label: "iterations", number: true }, { label: "evaluations", number: true }, { label: "failed", number: true }, { label: "why it stopped", wrap: true }],
