@@ -221,7 +221,7 @@ FitJob read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
     as_table(log.data, *request.model.system, arguments.smoothed).write(arguments.smoothed);
     // what went into a pipe cannot be read again
     if (arguments.smoothed != "/dev/stdout" && std::filesystem::is_regular_file(arguments.smoothed))
-      log.files.push_back(*CsvTable::read(arguments.smoothed, CsvTable::Keep::numbers).file());
+      log.files = {*CsvTable::read(arguments.smoothed, CsvTable::Keep::numbers).file()};
   }
   return prepare_raw_fit(log, std::move(arguments.request), arguments.raw);
 }

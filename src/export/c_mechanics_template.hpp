@@ -409,11 +409,11 @@ static void decompose_rows(workspace *w)
 /* Whether no acceleration satisfies A ddq = b: A L b is off b by more than rounding of what accelerates the system, b and F. */
 static int is_contradictory(workspace *w)
 {
-{redundant}  if (w->rank == @largest_rank@) return 0; /* redundant rows are off b by the error of the state */
   real inconsistency = 0, size_of_b = 0, size_of_force = 0;
   for (int k = 0; k < NC; ++k) {
     real off = w->b_unit[k];
     for (int i = 0; i < NQ; ++i) off -= w->A_unit[k + NC * i] * w->Lb[i];
+{redundant}    if (w->rank == @largest_rank@) off = 0; /* redundant rows are off b by the error of the state */
     off = fabs(w->row_scale[k] == 0 ? w->b[k] : off);
     if (off > inconsistency) inconsistency = off;
     if (fabs(w->b_unit[k]) > size_of_b) size_of_b = fabs(w->b_unit[k]);

@@ -516,9 +516,8 @@ FitRun run_thinned(const FitJob& job, const Worth& worth, const std::function<vo
   std::string text;
   if (worth.left > 0) {
     text = fmt::format(
-        ". More are not left out, so that enough remain: their residuals are still correlated by {:.2g}, and standard deviations "
-        "are "
-        "too small by a factor of about {:.2g}",
+        ". More are not left out, so that enough remain: their errors are probably still correlated by about {:.2g}, "
+        "and standard deviations too small by a factor of up to {:.2g}",
         worth.left, std::sqrt((1 + worth.left) / (1 - worth.left)));
   }
   outcome.notes.push_back(

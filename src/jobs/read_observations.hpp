@@ -17,7 +17,7 @@ LoggedSystem logged_system(const Model& fitted, const std::vector<Actuator>& act
 struct LogRows {
   std::vector<int> lines;                  // of each state in the log
   std::optional<CommandedRows> commanded;  // where inputs act late
-  bool has_wrong_rate = false;             // a column is not the rate of another over t
+  bool has_wrong_rate = false;             // a column is not the rate of another over t, or delays are in another unit than t
 };
 
 /// The accelerations that a log measures.

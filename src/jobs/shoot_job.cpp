@@ -252,7 +252,9 @@ FitFile moved_fit(const FitFile& fit, const Posterior& posterior, std::vector<Hy
   out.report.negative_log_likelihood = posterior.negative_log_likelihood();
   out.take_data(posterior);
   if (out.report.inducing) out.report.inducing->stretches.reset();  // which were of the parameters before
-  out.report.termination = fmt::format("parameters by multiple shooting, of a fit that ended so: {}", fit.report.termination);
+  const std::string& before = fit.report.termination;
+  if (!before.starts_with("parameters by multiple shooting"))
+    out.report.termination = fmt::format("parameters by multiple shooting, of a fit that ended so: {}", before);
   return out;
 }
 

@@ -203,9 +203,9 @@ SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, 
   std::vector<const CsvTable*> tables;
   if (const auto* table = std::get_if<CsvTable>(&request.start)) tables.push_back(table);
   if (request.inputs) tables.push_back(&*request.inputs);
+  const std::map<std::string, std::string> columns = checked_columns(model, tables, request.columns);
   if (tables.empty() && !request.columns.empty())
     throw InputError("`map` goes with a table, but neither `start` nor the inputs are one");
-  const std::map<std::string, std::string> columns = checked_columns(model, tables, request.columns);
   SimulateJob job;
   job.system = model.system;
   job.options.times = request.times;

@@ -325,19 +325,31 @@ MatrixXd among(const std::vector<std::string>& all, const std::vector<std::strin
 // @param readings  receives it; its view is given
 // @return the rows of the log that measure something at known acting inputs
 std::vector<int> read_more(const FitFile& fit, const Posterior& posterior, const std::vector<std::string>& names,
-                           bool reads_stddevs, LogReader& reader, Readings& readings, std::vector<std::string>& notes) {
+                           const UpdateRequest& request, LogReader& reader, Readings& readings, std::vector<std::string>& notes) {
   const Prior& prior = posterior.prior();
   const VectorXd& parameters = posterior.values().parameters;
   const CsvTable& log = reader.table();
   const bool projects = !fit.options.empty() && request_of(fit).problem.project;
-  // a block of few rows may have no value of a column, which the reader takes for a mistake
+  const bool reads_stddevs = !request.noise_stddev && !stated_accelerations(names, reader).empty();
+  // a block of few rows may have no value of a column, and a single row no deviation of one, which the reader takes for a mistake
+  const auto lacks_stddev = [&](const std::string& name) {
+    const int at = log.find(reader.stddev_column(name));
+    return reads_stddevs && log.n_rows() == 1 && at >= 0 && log.is_empty(at);
+  };
   std::vector<std::string> measured = names;
-  std::erase_if(measured, [&](const std::string& name) { return reader.has(name) && !reader.measures(name); });
+  std::erase_if(measured,
+                [&](const std::string& name) { return reader.has(name) && (!reader.measures(name) || lacks_stddev(name)); });
   readings.states = read_states(prior, readings.view, reader, projects);
   readings.values = among(names, measured, reader.measurements(measured));
   if (reads_stddevs) readings.stated_stddev = among(names, measured, stated_stddevs(fit.model, measured, reader, log.n_rows()));
   const std::optional<CommandedRows> commanded =
       take_commands(*prior.system, without_estimates(fit.model.actuators), reader, std::nullopt, {}, readings.states, notes);
+  if (commanded) {
+    double unit_of_time = 1;
+    wrong_rates_of(*prior.system, prior, log, checked_columns(fit.model, {&log}, request.columns), &unit_of_time);
+    if (const auto text = text_of_late_inputs(*prior.system, prior.reads(), without_estimates(fit.model.actuators), unit_of_time))
+      notes.push_back(fmt::format("warning: {}: {}", log.name(), *text));
+  }
   const MatrixXd state_stddevs = projects ? stated_state_deviations(*prior.system, reader) : MatrixXd();
   note_reading(reader, notes);
   if (projects) move_onto_constraints(*prior.system, parameters, log, state_stddevs, readings.states, notes);
@@ -440,8 +452,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   LogReader reader = open_log(fit.model, log, request.columns);
   const std::vector<std::string> stated = stated_accelerations(names, reader);
   Readings readings{std::move(view), {}, {}, {}};
-  const std::vector<int> rows =
-      read_more(fit, posterior, names, !stated.empty() && !request.noise_stddev, reader, readings, notes);
+  const std::vector<int> rows = read_more(fit, posterior, names, request, reader, readings, notes);
   Noise noise = noise_of_more(fit, posterior, readings, names, stated, request, log, notes);
   if (rows.empty()) {
     notes.push_back(

@@ -12,7 +12,7 @@
 namespace gp2 {
 
 /// Central differences, in the state, of numbers that only batches of states give: steps of h = (ε max(1, |x_k|))^(1/3), so that
-/// rounding and truncation are both about ε^(2/3).
+/// rounding and truncation are both about h².
 class StateDifferences {
  public:
   /// @param entries  the derivatives to take; sorted by state_index

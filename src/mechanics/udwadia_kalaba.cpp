@@ -237,11 +237,13 @@ void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const Matrix
   Lb_.noalias() = L_unit_ * b_unit_;
   residual_ = b_unit_;
   residual_.noalias() -= A_unit_ * Lb_;
+  // redundant rows are off b by the error of the state, which 0 = b_k is not
+  const bool may_be_off = rank_ == largest_rank && largest_rank < nc;
   for (Index k = 0; k < nc; ++k) {
-    inconsistency_ = std::max(inconsistency_, std::abs(row_scale_[k] == 0 ? b[k] : residual_[k]));
+    const double off = row_scale_[k] == 0 ? b[k] : may_be_off ? 0 : residual_[k];
+    inconsistency_ = std::max(inconsistency_, std::abs(off));
     size_of_b_ = std::max(size_of_b_, std::abs(b_unit_[k]));
   }
-  if (rank_ == largest_rank && largest_rank < nc) inconsistency_ = 0;
 }
 
 // T and L from Bᵀ, of unit columns, in rows_
@@ -472,6 +474,52 @@ std::optional<std::string> mass_fault(const System& system, const SystemValues& 
 }
 
 // of one state by itself
+std::optional<std::string> contradiction(bool is_beyond_rounding) {
+  if (!is_beyond_rounding) return std::nullopt;
+  return "the constraints contradict each other: no acceleration satisfies A ddq = b";
+}
+
+// The largest |A L b − b|, of rows of unit length.
+double distance_from_b(const Ref<const MatrixXd>& A, const Ref<const VectorXd>& b, const UdwadiaKalaba& projection) {
+  double distance = 0;
+  for (Index k = 0; k < A.rows(); ++k) {
+    const double length = A.row(k).norm();
+    if (length > 0) distance = std::max(distance, std::abs(A.row(k).dot(projection.Lb()) - b[k]) / length);
+  }
+  return distance;
+}
+
+// Redundant rows that hold always are off b by the error of the state. What conditional rows add to that is a contradiction.
+bool conditional_rows_contradict(const System& system, const SystemValues& values, int i, const UdwadiaKalaba& projection) {
+  constexpr double much = 100;
+  const auto A = values.A(i);
+  const int largest_rank = system.largest_rank_of(A);
+  if (!system.has_conditional_constraints() || largest_rank == system.nc() || projection.rank() != largest_rank) return false;
+  std::vector<int> always, others;
+  for (int row = 0; row < system.nc(); ++row) {
+    if (!system.is_conditional(row))
+      always.push_back(row);
+    else if (!A.row(row).isZero(0))
+      others.push_back(row);
+  }
+  if (others.empty()) return false;
+  const MatrixXd A_always = A(always, Eigen::all), A_others = A(others, Eigen::all);
+  const VectorXd b_always = values.b(i)(always), b_others = values.b(i)(others);
+  UdwadiaKalaba of_always, of_others;
+  of_always.compute(values.M(i), A_always, b_always, largest_rank - static_cast<int>(others.size()));
+  of_others.compute(values.M(i), A_others, b_others);
+  // how far the directions of the redundant rows differ, by which what others accelerate is off too
+  double spread = 0;
+  const MatrixXd left = A_always * of_always.T();
+  for (Index k = 0; k < left.rows(); ++k) {
+    const double length = A_always.row(k).norm();
+    if (length > 0) spread = std::max(spread, left.row(k).norm() / length);
+  }
+  const double by_state = distance_from_b(A_always, b_always, of_always) + spread * of_others.Lb().norm();
+  const double rounding = UdwadiaKalaba::consistency_tolerance * std::max(projection.size_of_b(), 1.0);
+  return distance_from_b(A, values.b(i), projection) > much * by_state + rounding;
+}
+
 std::optional<std::string> fault_at(const System& system, const SystemValues& values, const Ref<const MatrixXd>& states, int i,
                                     const UdwadiaKalaba& projection) {
   if (!values.M(i).allFinite())
@@ -486,7 +534,8 @@ std::optional<std::string> fault_at(const System& system, const SystemValues& va
     return "the constraints are redundant, so that none of them may have a noise of its own: leave out rows that follow from "
            "others";
   }
-  return mass_fault(system, values, i, projection);
+  if (auto text = mass_fault(system, values, i, projection)) return text;
+  return contradiction(conditional_rows_contradict(system, values, i, projection));
 }
 
 }  // namespace
@@ -531,11 +580,6 @@ namespace {
 
 // b is quadratic in the velocities, and where others move those at rest may be 1e-6 of theirs by rounding
 double rounding_of(double size_of_b) { return std::max(1e-12 * size_of_b, std::numeric_limits<double>::min()); }
-
-std::optional<std::string> contradiction(bool is_beyond_rounding) {
-  if (!is_beyond_rounding) return std::nullopt;
-  return "the constraints contradict each other: no acceleration satisfies A ddq = b";
-}
 
 // Each state by itself, up to the first with a fault. Returns the largest |b|.
 double evaluate_each(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,

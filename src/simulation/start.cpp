@@ -72,7 +72,7 @@ Nearest nearest_to(const System& system, const Eigen::VectorXd& parameters, cons
   return found;
 }
 
-// What is given stays as it is, and so does what the constraints do not read, though M may couple it to what moves.
+// What is given stays as it is and, where there is a solution, what the constraints do not read, though M may couple it to what moves.
 std::vector<bool> held_entries(const System& system, const StartingPoint& start) {
   std::vector<bool> held = start.given;
   const std::vector<bool> reads = system.reads(SystemPart::residuals);

@@ -223,7 +223,8 @@ void maximise(const std::vector<Measurement>& measurements, const Box& box, cons
   fit.noise_at_least = result.x[2] <= box.lower[2] + 1e-9;
 }
 
-/// Without a τ that the measurements do not need: at a speed that is nearly constant it stands for the noise as well as σ does.
+/// Without a τ that the measurements do not need: at a speed that is nearly constant it stands for the noise as well as σ does, and
+/// where σ is at its least it may stand for all of it.
 void leave_out_needless_time_noise(const std::vector<Measurement>& measurements, Box box, const std::atomic<bool>* stop,
                                    SmootherFit& fit) {
   constexpr double much = 2;      // of log likelihood, by one more parameter

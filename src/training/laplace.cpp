@@ -213,7 +213,9 @@ constexpr double far_from_optimum = 0.5;  // standard deviations
 
 // Whether the optimiser was stopped on its way, where all seems undetermined.
 bool is_on_the_way(const FitReport& report) {
-  return !report.converged && report.uncertainty->distance_from_optimum > far_from_optimum;
+  const bool is_cut_short =
+      report.termination.find("limit of iterations") != std::string::npos || report.termination == FitReport::interrupted;
+  return is_cut_short && report.uncertainty->distance_from_optimum > far_from_optimum;
 }
 
 void note_distance(const FitReport& report, const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {

@@ -94,7 +94,6 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   once.standard_errors = false;
   std::optional<FitReport> first, last;
   double objective = std::numeric_limits<double>::infinity();
-  int n_iterations = 0;
   bool stands = options.max_iterations == 0, is_stuck = false;
   // Where no latent acts the load is that of known forces. Beside it what presses on a constraint and what rubs there are found both
   // wrong, and each holds the other so. Without a mean at the start there is nothing better.
@@ -105,7 +104,6 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
     hyperparameters = report.hyperparameters;
     stands = std::abs(report.objective - objective) < enough;
     objective = report.objective;
-    n_iterations += report.iterations;
     if (!first) first = report;
     last = std::move(report);
     if (is_set(options.stop)) break;
@@ -120,13 +118,9 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   }
   once.n_draws = options.n_draws;
   once.standard_errors = options.standard_errors;
-  FitReport report;
-  if (last && is_set(options.stop)) {
-    report = *std::move(last);
-  } else {
-    report = trained(prior, observations, hyperparameters, once, linearisation.approximation());
-    n_iterations += report.iterations;
-  }
+  FitReport report = last && is_set(options.stop)
+                         ? *std::move(last)
+                         : trained(prior, observations, hyperparameters, once, linearisation.approximation());
   if (!first) return report;
   // the last run may leave the hyperparameters that have a mean
   if (linearisation.has_mean() && !is_set(options.stop) && !linearisation.move_to(report.hyperparameters)) {
@@ -136,10 +130,10 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
     report.draws.reset();
     stands = false;
   }
-  // the restarts are those of the run that searched
+  // the run that searched is told of, not those that stood where it ended
   report.restarts = std::move(first->restarts);
   report.best_restart = first->best_restart;
-  report.iterations = n_iterations;
+  report.iterations = first->iterations;
   report.n_escapes = first->n_escapes;
   report.converged = report.converged && stands && !is_set(options.stop);
   if (is_set(options.stop))

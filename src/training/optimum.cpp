@@ -255,8 +255,9 @@ class Training {
               has_bounded ? curvature_at(objective_, coordinates(at), at, evaluators_, options_.stop, AtBound::free_if_open)
                           : curvature,
               at);
-          // far from an optimum all seems undetermined
-          if (reports_[from].converged || curvature.distance_from_optimum() <= near) restore_undetermined(from, workspace);
+          // on the way to an optimum all seems undetermined
+          const bool is_cut_short = stopped() || reports_[from].iterations >= options_.max_iterations;
+          if (!is_cut_short || curvature.distance_from_optimum() <= near) restore_undetermined(from, workspace);
           return;
         }
         VectorXd scales = VectorXd::Ones(static_cast<Index>(at.size()));

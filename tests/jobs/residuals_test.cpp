@@ -168,7 +168,7 @@ TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
   EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted to {} of 300, evenly spaced", n_rows(fewer)))));
   // 300/40 rows apart they are still correlated by about 0.9^7
   EXPECT_THAT(fewer.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals are correlated from row to row"),
-                                                   HasSubstr("their residuals are still correlated by 0."))));
+                                                   HasSubstr("their errors are probably still correlated by about 0."))));
   EXPECT_LT(log.coverage(all), 0.8);
   EXPECT_GT(log.coverage(fewer), 0.85);
   // the same fit again, from its own file

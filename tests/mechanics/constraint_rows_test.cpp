@@ -3,6 +3,7 @@
 #include <stdexcept>
 
 #include <fmt/format.h>
+#include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "gp2/mechanics/callable_system.hpp"
@@ -173,6 +174,35 @@ TEST(ConstraintRowsTest, RedundantOnesStaySoBesideConditionalOnes) {
       const std::string text = "constraints: rank 2 of 3 rows: 1 redundant, which is allowed";
       const std::vector<Finding> findings = check_system(*more.system, measured, parameters);
       EXPECT_TRUE(std::ranges::any_of(findings, [&](const Finding& one) { return one.text == text; }));
+    }
+  }
+}
+
+// What conditional rows say against each other, or against those that hold always, is no error of the state.
+TEST(ConstraintRowsTest, ConditionalOnesContradictBesideRedundantOnesToo) {
+  const auto model_with = [](const std::string& conditional) {
+    return carts("position = ['x - y', 'sin(x) - sin(y)']\nacceleration = [" + conditional + "]");
+  };
+  const std::string one = "{ expr = 'ddz - 0.5*ddx - 1', when = 'touch > 0.5' }";
+  for (const double error : {0.0, 1e-6, 1e-4}) {
+    SCOPED_TRACE(error);
+    VectorXd state(8);  // x y z dx dy dz t touch
+    state << 0.4, 0.4 + error, 0.2, 0, 0, 0, 0, 1;
+    for (const double speed : {0.0, 1.0}) {
+      state[3] = speed;
+      state[4] = speed - error;
+      const auto fault_of = [&](const Model& model) {
+        MechanicsBatch batch;
+        evaluate_mechanics(*model.system, state, model.system->parameter_values(), batch);
+        return batch.fault;
+      };
+      EXPECT_FALSE(fault_of(model_with(one)).has_value());
+      for (const char* other :
+           {"{ expr = 'ddz - 0.5*ddx - 2', when = 'touch > 0.5' }", "{ expr = 'ddx - ddy - 1', when = 'touch > 0.5' }"}) {
+        const auto fault = fault_of(model_with(one + ", " + other));
+        ASSERT_TRUE(fault.has_value()) << other;
+        EXPECT_THAT(fault->text, testing::HasSubstr("contradict each other"));
+      }
     }
   }
 }

@@ -279,6 +279,20 @@ def test_fit_is_not_loaded_with_other_functions_than_it_had(surface, log, tmp_pa
         gp2.load(tmp_path / "fit.json", other(part, 1 + 1e-12))  # as another machine rounds
 
 
+def test_fit_of_a_latent_in_every_direction_is_loaded_with_its_functions(tmp_path):
+    """Each of its directions has a process of its own, all of one name."""
+    system = gp2.System.from_callables(
+        lambda states, _: (np.tile(np.diag([1.0, 2.0]), (len(states), 1, 1)), None, None, -states[:, :2]),
+        coordinates=["x", "y"], reads=["x", "y"], noise=0.1, latents=[{"features": ["dx", "dy"]}],
+    )  # fmt: skip
+    rows = np.random.default_rng(1).normal(size=(8, 6))
+    log = dict(zip(["x", "y", "dx", "dy", "ddx", "ddy"], rows.T, strict=True))
+    posterior = gp2.fit(system, log, mean="force", max_iterations=0)
+    posterior.save(tmp_path / "fit.json")
+    again = gp2.load(tmp_path / "fit.json", system)
+    np.testing.assert_array_equal(again.predict(log).mean, posterior.predict(log).mean)
+
+
 def test_several_threads_take_turns_in_the_functions(surface, log):
     """Functions with a state of their own, which give wrong numbers if another thread comes in between."""
     buffer = {}

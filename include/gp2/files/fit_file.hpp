@@ -63,8 +63,9 @@ struct FitFile {
 
   /// Written whole or not at all. @throws InputError when that fails, or `systems` lacks the model of another system.
   void write(const std::filesystem::path& path) const;
-  /// @param code  what the models of the fit left to code (Model::code), which a file cannot hold; it must be that of the fit, for
-  ///   the posterior to be, and is held against what that said at a few states of the data. The declaration's name tells mechanics of which model they are asked for.
+  /// @param code  what the models of the fit left to code (Model::code), which a file cannot hold. It must be the code of the fit, and is
+  ///   compared with what that said at a few states of the data. The declaration's name tells mechanics of which model they are asked
+  ///   for.
   /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, changed after it was written
   ///   (its checksum is of another content; the text says how a change that is meant is made good), with values out of place,
   ///   with code where there is none to give or none given where there is, or with other code than that of the fit.

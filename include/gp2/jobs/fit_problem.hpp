@@ -89,7 +89,7 @@ struct FitProblem {
   std::vector<Parameter> late;                          // delays and lags to estimate before all else …
   std::vector<std::optional<CommandedRows>> commanded;  // … from these Observations (per Observations, or none)
   bool robust = false;
-  bool has_wrong_rate = false;     // a column of a log is not the rate of another over t
+  bool has_wrong_rate = false;     // a column is not the rate of another over t, or delays are in another unit than t
   std::vector<std::string> notes;  // what a person should know: columns taken by alias, states off the constraint, …
 };
 

@@ -33,7 +33,7 @@ struct LearnedLog {
   std::shared_ptr<const Windows> windows;  // null: the rows themselves are learned from
   std::vector<double> gains;  // of each pass that was kept: log likelihood of the positions, beside a smoothing without a model
   std::vector<std::string> notes;
-  std::vector<LogFile> files = {};  // the raw log, if it is a file, and those that the smoothed one was written to
+  std::vector<LogFile> files = {};  // the raw log, if it is a file; that which the smoothed one was written to, if any
 
   /// The request of a fit to it, from that which it was learned for.
   /// @param name  of the log

@@ -20,7 +20,7 @@ namespace gp2 GP2_API {
 ///
 /// SymbolicSystem's is exact and allocates nothing after construction. That of any other System evaluates batches, which may
 /// allocate, and takes central differences over h = (ε max(1, |x_k|))^(1/3), of every entry that System::reads says may depend on
-/// x_k: their error is about ε^(2/3) ≈ 4e-11, relative to the size of the quantity and of its third derivative.
+/// x_k: their error is about h², 4e-11 where |x_k| ≤ 1, relative to the size of the quantity and of its third derivative.
 class StateEvaluator {
  public:
   using ConstMatrix = Eigen::Map<const Eigen::MatrixXd>;
