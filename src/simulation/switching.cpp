@@ -285,7 +285,7 @@ MatrixXd Switching::slopes(const Values& values, const VectorXd& share) {
 
 // Rows of normals and of drift are compared along the velocities that the constraints allow.
 void Switching::unite(const VectorXd& state, const Surfaces& surfaces) {
-  constexpr double alike = 1e-9;  // rows of length 1
+  constexpr double alike = 1e-6;  // rows of length 1
   std::iota(first_united_.begin(), first_united_.end(), 0);
   const std::vector<int> slid_on = sliding();
   // points of a plane turn, each in its own direction
