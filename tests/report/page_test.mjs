@@ -315,7 +315,7 @@ test("the likelihood of the fit is not that of rows that came later, and a const
     Object.assign(report.model.constraints[0], { when: "q1 < 2", contact: true });
   });
   const { page, close } = await open("changed.html");
-  assert.match(await page.locator("#tiles").textContent(), /at the fit; rows may have changed since/);
+  assert.match(await page.locator("#tiles").textContent(), /at the last fit or shoot; rows may have changed since/);
   assert.match(await page.locator("#constraints table").textContent(), /holds.*a contact, while q1 < 2/);
   await close();
   const plain = await open("surface.html");
