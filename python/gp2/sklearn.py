@@ -10,9 +10,11 @@ import numbers
 import os
 import re
 import warnings
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, overload
 
 import numpy as np
+import numpy.typing as npt
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_array, check_is_fitted
@@ -23,11 +25,15 @@ try:
     from sklearn.utils.validation import validate_data
 except ImportError:  # scikit-learn before 1.6
 
-    def validate_data(estimator, *arguments, **options):
+    def validate_data(estimator: Any, *arguments: Any, **options: Any) -> Any:
         return estimator._validate_data(*arguments, **options)
 
 
-class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+_Array = npt.NDArray[np.float64]
+_Table = Any  # an array or a frame, of pandas say
+
+
+class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
     """Learn accelerations ddq = f(q, dq, t, u) that obey the constraints of a mechanical system (Geist & Trimpe 2020).
 
     X holds states. An array has the columns of `system.state_names`: q, dq, t, u. A frame has columns by these names, in any
@@ -68,21 +74,21 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def __init__(
         self,
-        system=None,
+        system: gp2.System | str | os.PathLike[str] | None = None,
         *,
-        mean="zero",
-        prior=None,
-        baseline=None,
-        observe=None,
-        noise_std=None,
-        estimate=None,
-        discrepancy=True,
-        n_restarts=None,
-        max_iterations=1000,
-        n_threads=0,
-        random_state=0,
-        fit_options=None,
-    ):
+        mean: Literal["zero", "force"] = "zero",
+        prior: Literal["acceleration", "force"] | None = None,
+        baseline: Literal["se", "icm", "lmc"] | None = None,
+        observe: str | Sequence[str] | None = None,
+        noise_std: float | Literal["estimate", "stated"] | None = None,
+        estimate: Sequence[str] | None = None,
+        discrepancy: bool | Literal["default", "none"] = True,
+        n_restarts: int | None = None,
+        max_iterations: int = 1000,
+        n_threads: int = 0,
+        random_state: Any = 0,
+        fit_options: Mapping[str, Any] | None = None,
+    ) -> None:
         self.system = system
         self.mean = mean
         self.prior = prior
@@ -97,7 +103,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.random_state = random_state
         self.fit_options = fit_options
 
-    def fit(self, X, y) -> GP2Regressor:
+    def fit(self, X: _Table, y: _Table) -> GP2Regressor:
         """Fit to states X (n, len(state_names)) and accelerations y (n, nq) or (n,).
 
         Raises gp2.InputError, a ValueError, where X, y, the options and the system do not go together; gp2.NumericalError.
@@ -126,7 +132,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         names = self.system_.acceleration_names
         accelerations = np.full((len(rows), len(names)), np.nan)
         accelerations[:, self._rows_of_view()] = rows
-        options = {
+        options: dict[str, Any] = {
             "observe": self.outputs_ if len(self.outputs_) < len(names) else None,
             "mean": self.mean,
             "prior": self.prior,
@@ -150,7 +156,15 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.log_marginal_likelihood_value_ = -self.posterior_.report.negative_log_likelihood
         return self
 
-    def predict(self, X, return_std: bool = False, return_cov: bool = False):
+    @overload
+    def predict(self, X: _Table) -> _Array: ...
+    @overload
+    def predict(self, X: _Table, return_std: Literal[True]) -> tuple[_Array, _Array]: ...
+    @overload
+    def predict(self, X: _Table, return_std: Literal[False] = False, *, return_cov: Literal[True]) -> tuple[_Array, _Array]: ...
+    @overload
+    def predict(self, X: _Table, return_std: bool = False, return_cov: bool = False) -> _Array | tuple[_Array, _Array]: ...
+    def predict(self, X: _Table, return_std: bool = False, return_cov: bool = False) -> _Array | tuple[_Array, _Array]:
         """Mean (n, d), or (n,) for a flat y; then its standard deviation, of that shape, or its covariance.
 
         The covariance (n, n, d), or (n, n), is that of each output over all states. `posterior_.predict` has the one between the
@@ -169,18 +183,18 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         mean = self._as_y(prediction.mean[:, rows])
         return (mean, self._as_y(prediction.std[:, rows])) if return_std else mean
 
-    def sample_y(self, X, n_samples: int = 1, random_state=0) -> np.ndarray:
+    def sample_y(self, X: _Table, n_samples: int = 1, random_state: Any = 0) -> _Array:
         """Functions drawn from the posterior, at X: (n, d, n_samples), or (n, n_samples) for a flat y."""
         states = self._checked_states(X)
         samples = self.posterior_.sample(states, n_samples, seed=_seed(random_state))[:, :, self._rows_of_view()]
         samples = np.transpose(samples, (1, 2, 0))
         return samples[:, 0] if self._is_flat else samples
 
-    def score(self, X, y, sample_weight=None) -> float:
+    def score(self, X: _Table, y: _Table, sample_weight: npt.ArrayLike | None = None) -> float:
         """R² of the prediction, the mean over the columns of y."""
         check_is_fitted(self, "posterior_")
         y = _columns_by_name(y, self.outputs_, self.system_) if self._has_mechanics else y
-        return super().score(X, _without_mask(y), sample_weight)
+        return float(super().score(X, _without_mask(y), sample_weight))
 
     def _given_system(self) -> gp2.System | None:
         if self.system is None or isinstance(self.system, gp2.System):
@@ -189,7 +203,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise TypeError(f"system: expected a gp2.System, the path of a model file or None, got {self.system!r}")
         return gp2.System.load(self.system)
 
-    def _outputs(self, system: gp2.System, y) -> list[str]:
+    def _outputs(self, system: gp2.System, y: _Table) -> list[str]:
         names = system.acceleration_names
         if self.observe is not None:
             what, outputs = "observe", [self.observe] if isinstance(self.observe, str) else list(self.observe)
@@ -214,13 +228,13 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise gp2.InputError(f"X: expected {len(names)} columns, {', '.join(names)}; got {n_columns} feature(s)")
         return [names.index(name) for name in given or names]
 
-    def _states(self, X: np.ndarray, given: list[str] | None) -> np.ndarray:
+    def _states(self, X: _Array, given: list[str] | None) -> _Array:
         """States from X with columns of the names `given`, or, where there are none, of all states in order."""
         states = np.full((len(X), len(self.system_.state_names)), np.nan)
         states[:, self._columns_in_state(X.shape[1], given)] = X
         return states
 
-    def _checked_states(self, X) -> np.ndarray:
+    def _checked_states(self, X: _Table) -> _Array:
         check_is_fitted(self, "posterior_")
         if not self._has_mechanics:
             return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False), None)
@@ -237,11 +251,11 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _rows_of_view(self) -> list[int]:
         return [self.system_.acceleration_names.index(name) for name in self.outputs_]
 
-    def _as_y(self, values: np.ndarray) -> np.ndarray:
+    def _as_y(self, values: _Array) -> _Array:
         return values[..., 0] if self._is_flat else values
 
 
-def _system_without_mechanics(n_features: int, y: np.ndarray) -> gp2.System:
+def _system_without_mechanics(n_features: int, y: _Array) -> gp2.System:
     """Unit masses without constraints, pushed by functions of free inputs."""
     features = [f"x{k + 1}" for k in range(n_features)]
     outputs = [f"y{k + 1}" for k in range(y.shape[1])]
@@ -255,13 +269,13 @@ def _system_without_mechanics(n_features: int, y: np.ndarray) -> gp2.System:
     )
 
 
-def _warn_of_scaled(X: np.ndarray) -> None:
+def _warn_of_scaled(X: _Array) -> None:
     """States have the units of their system: what a scaler makes of them are others."""
     varied = X[:, np.ptp(X, axis=0) > 0]
     if varied.shape[1] < 2:
         return
 
-    def all_are(values, wanted):
+    def all_are(values: _Array, wanted: float) -> bool:
         return np.allclose(values, wanted, rtol=0, atol=1e-6)
 
     is_standard = all_are(varied.mean(axis=0), 0) and all_are(varied.std(axis=0), 1)
@@ -272,12 +286,13 @@ def _warn_of_scaled(X: np.ndarray) -> None:
             UserWarning, stacklevel=3)
 
 
-def _without_mask(values):
+def _without_mask(values: _Table) -> _Table:
     """A masked array as one that is NaN where it is masked: scikit-learn would take what is behind the mask."""
-    return values.astype(np.float64).filled(np.nan) if np.ma.isMaskedArray(values) else values
+    has_mask = isinstance(values, np.ma.MaskedArray)
+    return values.astype(np.float64).filled(np.nan) if has_mask else values
 
 
-def _column_names(what: str, table) -> list[str] | None:
+def _column_names(what: str, table: _Table) -> list[str] | None:
     """The names of a frame's columns; None where they are whole numbers, or it is no frame."""
     names = list(getattr(table, "columns", []))
     if hasattr(table, "column_names") or all(isinstance(name, numbers.Integral) for name in names):  # Arrow's columns are values
@@ -289,7 +304,7 @@ def _column_names(what: str, table) -> list[str] | None:
     return names
 
 
-def _name_of_series(y, system: gp2.System) -> list[str] | None:
+def _name_of_series(y: _Table, system: gp2.System) -> list[str] | None:
     """The name of a Series that is an acceleration of the system, in a list; None of all else."""
     return [y.name] if getattr(y, "name", None) in system.acceleration_names else None
 
@@ -307,7 +322,7 @@ def _refuse_twice(what: str, names: list[str]) -> None:
         raise gp2.InputError(f"{what}: {', '.join(twice)}: given twice")
 
 
-def _columns_by_name(y, names: list[str], system: gp2.System):
+def _columns_by_name(y: _Table, names: list[str], system: gp2.System) -> _Table:
     columns = _column_names("y", y)
     given = columns or _name_of_series(y, system)
     if given is None:
@@ -318,7 +333,7 @@ def _columns_by_name(y, names: list[str], system: gp2.System):
     return y[names] if columns else y
 
 
-def _seed(random_state) -> int:
+def _seed(random_state: Any) -> int:
     if isinstance(random_state, (int, np.integer)) and random_state >= 0:
         return int(random_state)
     return int(check_random_state(random_state).randint(2**31))

@@ -30,6 +30,8 @@ def test_mypy_is_content_with_stub_package_and_a_users_code(tmp_path):
     strict = ["mypy", "--strict", "--warn-unused-ignores", f"--cache-dir={tmp_path}"]
     mypy(*strict, "-m", "gp2", "-m", "gp2._gp2", "-m", "gp2._model_text", "-m", "gp2._objects", "-m", "gp2._plots")
     mypy(*strict, str(Path(__file__).with_name("typed_usage.py")))
+    mypy(*strict, "--ignore-missing-imports", "-m", "gp2.sklearn")
+    mypy(*strict, "--ignore-missing-imports", str(Path(__file__).with_name("typed_regressor.py")))
 
 
 def test_stubtest_finds_no_difference(tmp_path):
