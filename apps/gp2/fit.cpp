@@ -15,6 +15,7 @@
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
+#include "jobs/hyperparameters_json.hpp"
 #include "ranks.hpp"
 #include "streams.hpp"
 
@@ -93,17 +94,9 @@ Json to_json(const Evaluation::Part& scores) {
 
 Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
   const FitReport& report = outcome.file.report;
-  Json hyperparameters = Json::array();
   Json errors = Json::array();  // of parameters, with their correlations
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
-    const std::string unit = unit_of(h, outcome.file.model);
-    hyperparameters.push_back({{"name", h.name},
-                               {"value", h.value},
-                               {"lower", h.lower},
-                               {"upper", h.upper},
-                               {"unit", unit.empty() ? h.unit : unit},
-                               {"at_bound", h.at_bound()}});
     if (h.kind != Hyperparameter::Kind::parameter || !(report.uncertainty || report.draws)) continue;
     Json correlation = Json::object();
     for (std::size_t l = 0; l < report.hyperparameters.size(); ++l) {
@@ -120,7 +113,7 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
                {"iterations", report.iterations},
                {"seconds", report.seconds},
                {"options", Json::parse(outcome.file.options)},
-               {"hyperparameters", hyperparameters}};
+               {"hyperparameters", hyperparameters_json(report, outcome.file.model)}};
   if (report.uncertainty) {
     json["standard_errors"] = {{"parameters", errors}, {"distance_from_optimum", report.uncertainty->distance_from_optimum}};
   } else if (!errors.empty()) {

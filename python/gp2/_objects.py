@@ -61,6 +61,8 @@ def _read_posterior(content: bytes) -> _gp2.Posterior:
 # a posterior travels as the content of its file
 def _reduce_posterior(posterior: _gp2.Posterior) -> tuple[Any, ...]:
     _reduce_system(posterior.system)
+    if posterior._has_code:
+        raise TypeError(f"a fit of '{posterior.system.name}' that learned from another system's log cannot be pickled: that system has functions")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "fit.json")
         posterior.save(path)

@@ -63,6 +63,10 @@ struct PyPosterior {
   std::vector<std::string> notes;
 
   [[nodiscard]] const System& system() const { return *file.model.system; }
+  /// Whether Python functions may run in a call: those of the fitted system, or of another that it was learned from.
+  [[nodiscard]] bool has_code() const {
+    return file.model.code || std::ranges::any_of(file.systems, [](const auto& one) { return one && one->code; });
+  }
 };
 
 /// Methods of a posterior that move, and the functions gp2.simulate and gp2.excite. They have their keywords in signatures of our own.

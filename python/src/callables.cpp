@@ -174,17 +174,17 @@ std::vector<CallableSystem::Constraint> constraints_of(const py::object& given) 
     add(by_level, "constraints", ConstraintLevel::acceleration);
     return constraints;
   }
-  for (const auto& [key, names] : py::reinterpret_borrow<py::dict>(by_level)) {
-    const std::string word = py::str(key), what = fmt::format("constraints['{}']", word);
-    if (word == "position") {
-      add(names, what, ConstraintLevel::position);
-    } else if (word == "velocity") {
-      add(names, what, ConstraintLevel::velocity);
-    } else if (word == "acceleration") {
-      add(names, what, ConstraintLevel::acceleration);
-    } else {
+  const auto levels = py::reinterpret_borrow<py::dict>(by_level);
+  for (const auto& [key, names] : levels) {
+    const std::string word = py::str(key);
+    if (word != "position" && word != "velocity" && word != "acceleration")
       throw InputError(fmt::format("constraints: expected 'position', 'velocity' or 'acceleration', got '{}'", word));
-    }
+  }
+  // rows have this order, whatever that of the dict
+  for (const auto& [word, level] :
+       {std::pair("position", ConstraintLevel::position), std::pair("velocity", ConstraintLevel::velocity),
+        std::pair("acceleration", ConstraintLevel::acceleration)}) {
+    if (levels.contains(word)) add(levels[word], fmt::format("constraints['{}']", word), level);
   }
   return constraints;
 }

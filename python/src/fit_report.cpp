@@ -157,6 +157,7 @@ void define_report(py::class_<FitReport>& report) {
           "std, interval95, r_hat and effective_size; else None.")
       .def("correlation", &correlation, "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
       .def("__getitem__", &value_of)
+      .def("keys", &names_of, "Names of the hyperparameters.")
       .def("__contains__",
            [](const FitReport& self, const py::object& name) {
              return py::isinstance<py::str>(name) && std::ranges::count(names_of(self), name.cast<std::string>()) > 0;

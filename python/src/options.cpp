@@ -56,7 +56,7 @@ void read_named_numbers(py::handle given, NamedNumbers& numbers, const std::stri
   if (py::isinstance<py::dict>(value)) {
     numbers.values = argument<std::map<std::string, double>>(value, name, "numbers by name");
   } else {
-    numbers.file = path_argument(value, name);
+    numbers.file = path_argument(value, name, "a path, or numbers by name");
   }
 }
 

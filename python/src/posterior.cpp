@@ -307,7 +307,7 @@ py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::
 // model take that lock, in several threads: there a copy is changed without it.
 template <typename Work>
 void change(PyPosterior& self, const Work& work) {
-  if (!self.file.model.code) return work(self);
+  if (!self.has_code()) return work(self);
   PyPosterior copy = self;
   unlocked([&] { work(copy); });
   self = std::move(copy);
@@ -350,7 +350,7 @@ void update_with(PyPosterior& self, const py::object& data, const GivenNames& ob
   std::vector<std::string> notes;
   const CsvTable log = to_table(data, "data");
   const auto read = [&](const PyPosterior& at) { return more_observations(at.file, at.posterior, log, request, notes); };
-  Observations more = self.file.model.code ? unlocked([&, held = self] { return read(held); }) : read(self);
+  Observations more = self.has_code() ? unlocked([&, held = self] { return read(held); }) : read(self);
   tell(std::exchange(notes, {}));
   change(self, [&](PyPosterior& changed) { add_observations(changed, std::move(more), log, request, notes); });
   tell(notes);
@@ -374,6 +374,14 @@ void save(const PyPosterior& self, const py::object& path) {
   file.take_data(self.posterior);
   const std::filesystem::path to = path_argument(path);
   unlocked([&] { file.write(to); });
+  std::vector<std::string> notes;
+  if (self.file.model.code && std::ranges::any_of(file.systems, [](const auto& one) { return one && one->code; })) {
+    notes.emplace_back(
+        "warning: several systems of this fit are functions, but gp2.load takes one: the file is read only if their functions "
+        "are the "
+        "same");
+  }
+  tell(notes);
 }
 
 // ---------------------------------------------------------------- classes of results
@@ -486,6 +494,7 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
             return py::module_::import("json").attr("loads")(self.file.options);
           },
           "What the fit was asked, a dict under the names of the options of gp2 fit; None where a file does not say.")
+      .def_property_readonly("_has_code", &PyPosterior::has_code)
       .def_readonly("notes", &PyPosterior::notes,
                     "What the reading of the data and the fit had to say; of a file, what the fit had.")
       .def_property_readonly(
@@ -697,11 +706,13 @@ A folder that does not exist is made.
 FitFile read_fit(const py::object& path, const PySystem* system) {
   const std::filesystem::path from = path_argument(path);
   const ModelCode code = code_of(system);
-  FitFile file = unlocked([&] { return FitFile::read(from, code); });
   if (system != nullptr && !code) {
-    throw InputError("system: this fit is all text; to predict under another system, give it to predict(…, system=)");
+    throw InputError(
+        "system: it has no functions, which is all that a file cannot hold: load without it, or with the system of the fit; to "
+        "predict "
+        "under another system, give it to predict(…, system=)");
   }
-  return file;
+  return unlocked([&] { return FitFile::read(from, code); });
 }
 
 void add_posterior(py::module_& module) {

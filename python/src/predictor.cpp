@@ -49,6 +49,9 @@ std::vector<bool> entries_read(const Prior& prior, const View& view) {
   return reads;
 }
 
+// Whether Python functions, of the fitted system or of another, may run in a call.
+bool calls_python(const PyPosterior& posterior, const PySystem* system) { return posterior.has_code() || code_of(system); }
+
 Eigen::Map<const Eigen::VectorXd> map(const Numbers& x) { return {x.data(), x.size()}; }
 Eigen::Map<Eigen::VectorXd> map_out(py::array_t<double>& x) { return {x.mutable_data(), x.size()}; }
 
@@ -70,11 +73,13 @@ Predictor::Storage storage_argument(const std::string& storage) {
 /// interpreter's lock: then each call has its own memory.
 class PyPredictor {
  public:
-  /// @param reads  of the entries of a state, which are read
-  PyPredictor(const PyPosterior& posterior, const View& view, const Predictor::Options& options, std::vector<bool> reads)
+  /// @param reads     of the entries of a state, which are read
+  /// @param has_code  as calls_python
+  PyPredictor(const PyPosterior& posterior, const View& view, const Predictor::Options& options, std::vector<bool> reads,
+              bool has_code)
       : predictor_(posterior.posterior, view, options),
         workspace_(predictor_.make_workspace()),
-        model_has_code_(posterior.file.model.code),
+        model_has_code_(has_code),
         names_(posterior.system().state_names()),
         reads_(std::move(reads)) {}
 
@@ -173,17 +178,23 @@ PyPredictor make(const PyPosterior& posterior, const std::string& quantity, cons
                  const std::string& storage) {
   const ViewRequest request{quantity_argument(quantity), dt, latent, model_of(system)};
   const PredictedView at = predicted_view(posterior.file, posterior.posterior.prior(), request);
-  return {posterior, at.view, {std, jacobian, storage_argument(storage)}, entries_read(at.prior, at.view)};
+  return {posterior,
+          at.view,
+          {std, jacobian, storage_argument(storage)},
+          entries_read(at.prior, at.view),
+          calls_python(posterior, system)};
 }
 
 /// Inverse dynamics and the memory of its caller, as PyPredictor.
 class PySolver {
  public:
-  /// @param reads  of the entries of a state, which must be finite
-  PySolver(const PyPosterior& posterior, const View& view, const InverseDynamicsSolver::Options& options, std::vector<bool> reads)
+  /// @param reads     of the entries of a state, which must be finite
+  /// @param has_code  as calls_python
+  PySolver(const PyPosterior& posterior, const View& view, const InverseDynamicsSolver::Options& options, std::vector<bool> reads,
+           bool has_code)
       : solver_(posterior.posterior, view, options),
         workspace_(solver_.make_workspace()),
-        model_has_code_(posterior.file.model.code),
+        model_has_code_(has_code),
         names_(posterior.system().state_names()),
         wanted_names_(view.names(posterior.system())),
         reads_(std::move(reads)),
@@ -249,7 +260,7 @@ PySolver make_solver(const PyPosterior& posterior, const GivenNames& outputs, co
   const StateLayout layout = at.model->system->layout();
   for (int k = 0; k < layout.nu; ++k)
     reads[static_cast<std::size_t>(layout.u(k))] = false;  // the search begins at 0 where one is NaN
-  return {posterior, view, {cov, storage_argument(storage)}, std::move(reads)};
+  return {posterior, view, {cov, storage_argument(storage)}, std::move(reads), calls_python(posterior, system)};
 }
 
 }  // namespace

@@ -16,8 +16,12 @@ namespace gp2::python {
 namespace {
 
 bool is_missing(const py::handle& cell) {
-  if (cell.is_none() || (PyFloat_Check(cell.ptr()) != 0 && std::isnan(PyFloat_AS_DOUBLE(cell.ptr())))) return true;
-  return std::string(py::str(py::type::handle_of(cell).attr("__name__"))) == "NAType";  // pandas.NA
+  if (cell.is_none() || std::string(py::str(py::type::handle_of(cell).attr("__name__"))) == "NAType") return true;  // pandas.NA
+  // NaN of any type, also pandas.NaT, differs from itself
+  const auto other = py::reinterpret_steal<py::object>(PyObject_RichCompare(cell.ptr(), cell.ptr(), Py_NE));
+  const int differs = other ? PyObject_IsTrue(other.ptr()) : -1;
+  if (differs < 0) PyErr_Clear();
+  return differs == 1;
 }
 
 // a column of a table; NaN stands for an empty cell, as pandas reads one

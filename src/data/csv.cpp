@@ -84,14 +84,18 @@ double number_in(std::string_view cell) {
   return parsed.is_number() ? parsed.value : not_a_number;
 }
 
-// throws the reason why a cell is no number
-void refuse_cell(const std::string& cell, const std::string& place) {
+// throws the reason why a cell of a column is no number
+void refuse_cell(const std::string& cell, const std::string& column, const std::string& place, bool may_be_empty = false) {
   const auto fail = [&](const std::string& what) { throw InputError(fmt::format("{}: {}", place, what)); };
   const Parsed parsed = parse_number(cell);
   if (trim(cell).empty()) fail("the cell is empty; a number is needed here");
   if (parsed.is_whole && parsed.error == std::errc::result_out_of_range)
     fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", shortened(cell)));
-  fail(fmt::format("'{}' is not a finite number", shortened(cell)));
+  const bool is_nan = parsed.is_whole && parsed.error == std::errc() && std::isnan(parsed.value);
+  fail(fmt::format("'{}' is not a finite number{}", shortened(cell),
+                   cell == column           ? ": the header again: are these files that were joined? Remove the line"
+                   : may_be_empty && is_nan ? "; leave the cell empty where nothing is measured"
+                                            : ""));
 }
 
 // names that are there, once each, and not too many
@@ -734,11 +738,16 @@ std::string CsvTable::place(int row, int column) const {
 
 double CsvTable::number(int row, int column) const {
   const double value = content_->number(row, column);
-  if (std::isnan(value)) refuse_cell(cell(row, column), place(row, column));
+  if (std::isnan(value)) refuse_cell(cell(row, column), header()[static_cast<std::size_t>(column)], place(row, column));
   return value;
 }
 
-double CsvTable::number_or_empty(int row, int column) const { return is_empty(row, column) ? not_a_number : number(row, column); }
+double CsvTable::number_or_empty(int row, int column) const {
+  const double value = content_->number(row, column);
+  if (std::isnan(value) && !is_empty(row, column))
+    refuse_cell(cell(row, column), header()[static_cast<std::size_t>(column)], place(row, column), true);
+  return value;
+}
 
 double CsvTable::number_or_nan(int row, int column) const {
   const double value = content_->number(row, column);

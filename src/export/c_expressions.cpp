@@ -26,10 +26,11 @@ constexpr Piece helpers[] = {
   return x != x || x > y ? x : y;
 }
 )c"},
-    {"product_or_zero", R"c(/* x y, but 0 where x is 0, whatever y is */
+    {"product_or_zero", R"c(/* x y, but 0 where x is negligible, whatever y is */
 static real product_or_zero(real x, real y)
 {
-  return x == 0 ? 0 : x * y;
+  const real negligible = sizeof(real) < sizeof(double) ? (real)1e-18 : (real)1e-100;
+  return x < negligible && x > -negligible ? 0 : x * y;
 }
 )c"},
     {"square", R"c(static real square(real x)

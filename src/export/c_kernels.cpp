@@ -150,7 +150,9 @@ void Writer::write_kernels() {
   for (Piece& piece : pieces) {
     if (options_.single_precision && piece.name == float_exponentials.name) piece = float_exponentials;
   }
-  expressions.insert(before, called_pieces(pieces, expressions + " weighted_sum("));
+  // of latents that are no potentials, and of deviations
+  const std::string sums = has("other") || has("stddev") ? " weighted_sum(" : "";
+  expressions.insert(before, called_pieces(pieces, expressions + sums));
 }
 
 }  // namespace gp2::c_export

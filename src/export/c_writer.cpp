@@ -154,6 +154,14 @@ void Writer::set_names() {
   for (const char* const called : {"sign_of", "smaller", "larger", "product_or_zero", "square", "integer_power", "pow", "powf"}) {
     taken.insert(called);
   }
+  // the source may be compiled as C++, whose words these are too
+  taken.insert(
+      {"and",      "and_eq",       "bitand",   "bitor",  "catch",   "char8_t",    "char16_t",  "char32_t",  "class",
+       "co_await", "co_return",    "co_yield", "compl",  "concept", "const_cast", "consteval", "constinit", "decltype",
+       "delete",   "dynamic_cast", "explicit", "export", "friend",  "mutable",    "namespace", "new",       "noexcept",
+       "not",      "not_eq",       "operator", "or",     "or_eq",   "private",    "protected", "public",    "reinterpret_cast",
+       "requires", "static_cast",  "template", "this",   "throw",   "try",        "typeid",    "typename",  "using",
+       "virtual",  "wchar_t",      "xor",      "xor_eq"});
   for (const internal::Function& function : internal::functions) {
     taken.emplace(function.c);
     taken.insert(std::string(function.c) + "f");

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <set>
+#include <string>
+#include <vector>
 
 #include <fmt/format.h>
 
@@ -27,15 +29,15 @@ std::string pattern(int rows, int columns, bool is_dense = true) {
 bool is_casadi_name(const std::string& name) { return name.front() != '_' && name.find("__") == std::string::npos; }
 
 bool is_taken_in_casadi(const std::string& name) {
-  // a function `set` would have the size of its memory in `set_work`
   static const std::set<std::string> taken = {"NQ", "NU", "NX", "NR", "WORK", "of_coordinates", "of_time", "of_inputs", "of_rows",
-                                              "of_nothing", "patterns_in", "names_in", "read_state", "set", "set_work",
-                                              "rows_by_coordinates", "rows_by_time", "rows_by_inputs", "casadi_real",
-                                              "casadi_int",
-                                              // functions of the C library that expressions and portable functions call
-                                              "pow", "frexp", "ldexp", "copysign", "floor"};
-  return taken.contains(name) || std::any_of(internal::functions.begin(), internal::functions.end(),
-                                             [&](const internal::Function& function) { return function.c == name; });
+                                              "of_nothing", "patterns_in", "names_in", "read_state", "rows_by_coordinates",
+                                              "rows_by_time", "rows_by_inputs", "casadi_real", "casadi_int",
+                                              // a function `set` would have the size of its memory in `set_work`
+                                              "set", "set_work"};
+  // functions of the C library that expressions and portable functions call; compilers know those of floats, sqrtf say, as well
+  std::vector<std::string> called = {"pow", "frexp", "ldexp", "copysign", "floor"};
+  for (const internal::Function& function : internal::functions) called.emplace_back(function.c);
+  return taken.contains(name) || std::ranges::any_of(called, [&](const std::string& c) { return name == c || name == c + "f"; });
 }
 
 std::string casadi_source(const std::string& name, const StateLayout& layout, int n_rows, const CSourceOptions& options) {

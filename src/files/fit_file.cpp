@@ -287,18 +287,19 @@ std::map<std::string, double> read_start_values(const std::filesystem::path& pat
   } else {
     throw InputError(fmt::format("{}: expected {{\"name\": value, …}} or a file written by gp2 fit", path.string()));
   }
-  set_start_values(values, path.string(), hyperparameters);
+  set_start_values(values, path.string(), hyperparameters, others);
   return left_out;
 }
 
 void set_start_values(const std::map<std::string, double>& values, const std::string& source,
-                      std::vector<Hyperparameter>& hyperparameters) {
+                      std::vector<Hyperparameter>& hyperparameters, const std::vector<std::string>& others) {
   std::vector<Hyperparameter> started = hyperparameters;
   for (const auto& [name, value] : values) {
     const auto h = find_named(started, name);
     if (h == started.end()) {
       std::vector<std::string> known;
       for (const Hyperparameter& other : started) known.push_back(other.name);
+      known.insert(known.end(), others.begin(), others.end());
       throw InputError(fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", source, name, fmt::join(known, ", ")));
     }
     // a value printed with a few digits less may lie a rounding outside

@@ -27,9 +27,11 @@ using Eigen::VectorXd;
 
 namespace {
 
-// Counts of standardised errors within central intervals; NaN is none.
-struct CentralCounts {
-  VectorXd levels, n_within = VectorXd::Zero(levels.size());
+// Counts of standardised errors z within central intervals, and of Φ(z) in equal parts of [0, 1]; NaN is none.
+struct ErrorCounts {
+  VectorXd levels;
+  int n_bins = 1;
+  VectorXd n_within = VectorXd::Zero(levels.size()), n_in_bin = VectorXd::Zero(n_bins);
   double n = 0;
 
   void add(double z) {
@@ -38,38 +40,24 @@ struct CentralCounts {
     // the central interval that just holds it
     const double probability = std::erf(std::abs(z) / std::numbers::sqrt2);
     for (Index l = 0; l < levels.size(); ++l) n_within[l] += probability <= levels[l] ? 1 : 0;
-  }
-  [[nodiscard]] VectorXd shares() const { return n_within / n; }
-};
-
-// Counts of Φ(z) in equal parts of [0, 1].
-struct PitCounts {
-  VectorXd n_within;
-  double n = 0;
-
-  explicit PitCounts(int n_bins) : n_within(VectorXd::Zero(n_bins)) {}
-  void add(double z) {
-    if (std::isnan(z)) return;
-    ++n;
     const double pit = 0.5 * std::erfc(-z / std::numbers::sqrt2);
-    n_within[std::min(static_cast<Index>(pit * static_cast<double>(n_within.size())), n_within.size() - 1)] += 1;
+    n_in_bin[std::min(static_cast<Index>(pit * n_bins), n_in_bin.size() - 1)] += 1;
   }
-  [[nodiscard]] VectorXd shares() const { return n_within / n; }
+  [[nodiscard]] VectorXd coverage() const { return n_within / n; }
+  [[nodiscard]] VectorXd pit() const { return n_in_bin / n; }
 };
 
 // Standardised errors under Gaussian marginals, and their mean negative log density.
 struct StandardisedErrors {
   double sum = 0;
   int n = 0;
-  CentralCounts within{Eigen::Vector3d(0.5, 0.8, 0.95)};
-  PitCounts pit{Calibration::n_bins};
+  ErrorCounts counts{Eigen::Vector3d(0.5, 0.8, 0.95), Calibration::n_bins};
 
   void add(double error, double stddev) {
     const double z = error / stddev;
     sum += 0.5 * z * z + std::log(stddev) + 0.5 * std::log(2 * std::numbers::pi);
     ++n;
-    within.add(z);
-    pit.add(z);
+    counts.add(z);
   }
   [[nodiscard]] double nlpd() const { return n == 0 ? not_a_number : sum / n; }
 };
@@ -90,8 +78,8 @@ struct Scores {
   }
   [[nodiscard]] VectorXd rmse() const { return (squares.array() / counts.array()).sqrt(); }
   [[nodiscard]] Calibration calibration() const {
-    const VectorXd of_measured = measured.within.shares(), of_latent = latent.within.shares();
-    return {of_measured[0], of_measured[1], of_measured[2], of_latent[0], of_latent[1], of_latent[2], measured.pit.shares()};
+    const VectorXd of_measured = measured.counts.coverage(), of_latent = latent.counts.coverage();
+    return {of_measured[0], of_measured[1], of_measured[2], of_latent[0], of_latent[1], of_latent[2], measured.counts.pit()};
   }
   [[nodiscard]] Evaluation::Part part(double spread) const {
     const VectorXd of_observed = (counts.array() > 0).select(rmse(), 0);
@@ -179,16 +167,16 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
 }
 
 VectorXd central_coverage(const Ref<const VectorXd>& z, const Ref<const VectorXd>& levels) {
-  CentralCounts counts{levels};
+  ErrorCounts counts{levels};
   for (const double one : z) counts.add(one);
-  return counts.shares();
+  return counts.coverage();
 }
 
 VectorXd pit_histogram(const Ref<const VectorXd>& z, int n_bins) {
   if (n_bins < 1) throw InputError(fmt::format("pit_histogram: n_bins must be 1 or more, got {}", n_bins));
-  PitCounts counts(n_bins);
+  ErrorCounts counts{{}, n_bins};
   for (const double one : z) counts.add(one);
-  return counts.shares();
+  return counts.pit();
 }
 
 std::vector<int> observed_rows(const Posterior& posterior) { return rows_of(posterior.observations(), {}); }
@@ -336,7 +324,7 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
         const double distance = far * std::max(1.0, median(distances) / median_of_normal);
         one.n_far = static_cast<int>(std::ranges::count_if(distances, [&](double z) { return z > distance; }));
       }
-      one.coverage95 = errors.within.shares()[2];
+      one.coverage95 = errors.counts.coverage()[2];
       // values that sums stand for are smoothed, and so their errors; what is known of other views need not be of a motion
       const bool is_motion = are_all && !group.has_sums() && one.is_of_ddq;
       serial.push_back(is_motion ? in_order : SerialSums());

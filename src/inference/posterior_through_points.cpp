@@ -117,7 +117,10 @@ std::shared_ptr<LatentPosterior> nonlinear_with(const InducingPosterior& before,
   VectorXd mean = before.mean();
   for (int step = 0; step < most; ++step) {
     const auto about = linearise_through_points(prior, added, values, before.inducing(), mean, 1);
-    if (!about) break;
+    if (!about) {
+      static_cast<void>(require_models(prior, added, values.parameters, nullptr));  // names the state
+      break;
+    }
     auto all = std::make_shared<InducingPosterior>(before);
     if (!all->append(BlocksOfStates(prior, added, values, about.get()))) throw_not_definite();
     const double distance = (all->mean() - mean).norm() / std::sqrt(1 + mean.squaredNorm());

@@ -1,6 +1,7 @@
 #include "inference/query.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 #include "gp2/error.hpp"
 #include "inference/latent_sums.hpp"
@@ -111,11 +112,19 @@ struct IndependentColumns {
 // Those of a matrix of d columns, each in a unit of its own, that the others depend on.
 IndependentColumns independent_columns(MatrixXd X) {
   constexpr double rounding = 1e-12;  // of columns of unit norm
+  constexpr double smallest = 1e-150;
   const Index d = X.cols();
   VectorXd norms(d), reflection(std::min(X.rows(), d));
+  for (Index k = 0; k < d; ++k) norms[k] = X.col(k).stableNorm();
+  // a column whose square vanishes, alone or beside that of the largest, has no variance, and no other is a multiple of it
+  const double largest = norms.maxCoeff();
+  const double least = std::isfinite(largest) ? smallest * std::max(1.0, largest) : 0;
   for (Index k = 0; k < d; ++k) {
-    norms[k] = X.col(k).stableNorm();
-    if (norms[k] > 0) X.col(k) /= norms[k];
+    if (norms[k] <= least) {
+      X.col(k).setZero();
+    } else {
+      X.col(k) /= norms[k];
+    }
   }
   Eigen::VectorXi order(d);
   const Index r = internal::pivoted_qr(X, reflection, order, rounding);

@@ -90,11 +90,11 @@ void clear_unknown(const CommandedRows& commanded, const CsvTable& log, MatrixXd
   const bool is_predicted = accelerations.rows() == 0;
   if (is_predicted && !begins_at_rest) {
     notes.push_back(
-        fmt::format("warning: {}: {} of {} rows are predicted as if the inputs had been at rest before, but the log does not "
-                    "begin at rest: what acts there depends on commands before the log",
+        fmt::format("warning: {}: {} of {} rows are predicted as if each input had held its first value before, but the "
+                    "log begins neither with constant inputs nor with 0: what acts there depends on commands before the log",
                     log.name(), n_unknown, log.n_rows()));
   } else {
-    notes.push_back(unknown_text(log, n_unknown, is_predicted ? "as if the inputs had been at rest before" : "left out"));
+    notes.push_back(unknown_text(log, n_unknown, is_predicted ? "as if each input had held its first value before" : "left out"));
   }
 }
 

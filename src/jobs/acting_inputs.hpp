@@ -34,7 +34,7 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
 void keep_known(const CommandedRows& commanded, const CsvTable& log, std::vector<int>& rows, std::vector<std::string>& notes);
 
 /// Accelerations count as not measured where what acts is not known.
-/// @param accelerations  (accelerations × N); without rows predictions are made, as if the inputs had been at rest before the log
+/// @param accelerations  (accelerations × N); without rows predictions are made, each input held at its first value before
 void clear_unknown(const CommandedRows& commanded, const CsvTable& log, Eigen::MatrixXd& accelerations,
                    std::vector<std::string>& notes);
 

@@ -6,7 +6,6 @@
 #include <optional>
 
 #include <fmt/format.h>
-#include <Eigen/Cholesky>
 
 #include "base/decompositions.hpp"
 #include "base/lapack.hpp"
@@ -298,20 +297,18 @@ class ActuatorTraining {
     } catch (const NumericalError&) {
       return out;  // without deviations: an estimate stands where J is not finite near it
     }
-    const Eigen::LDLT<MatrixXd> decomposed(peak->information);
-    const bool has_peak = decomposed.isPositive() && decomposed.rcond() > 1e-12;
-    const MatrixXd covariance = decomposed.solve(MatrixXd::Identity(std::ssize(free), std::ssize(free)));
+    const std::optional<MatrixXd> covariance = inverse_of_definite(peak->information);
     for (Index f = 0; f < std::ssize(free); ++f) {
       const Index k = free[static_cast<std::size_t>(f)];
       ActuatorEstimate& one = out[static_cast<std::size_t>(k)];
-      if (has_peak) one.stddev = std::sqrt(covariance(f, f));
+      if (covariance) one.stddev = std::sqrt((*covariance)(f, f));
       // wider than a box that is believed evenly is no peak
       if (one.stddev > (one.upper - one.lower) / std::sqrt(12.0)) one.stddev = not_a_number;
       if (is_open(k)) one.stddev = infinity;
     }
     const auto is_known = [&](Index k) { return std::isfinite(out[static_cast<std::size_t>(k)].stddev); };
-    if (!std::ranges::all_of(free, is_known)) return out;
-    const MatrixXd moves = peak->slopes * MatrixXd(covariance.llt().matrixL());
+    if (!covariance || !std::ranges::all_of(free, is_known)) return out;
+    const MatrixXd moves = peak->slopes * cholesky_factor(*covariance);
     for (Index k = 0; k < x_.size(); ++k) {
       const Hyperparameter& h = problem_.hyperparameters[static_cast<std::size_t>(k)];
       if (!h.is_system_parameter()) continue;

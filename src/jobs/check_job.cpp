@@ -10,14 +10,15 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <Eigen/QR>
 
+#include "base/decompositions.hpp"
 #include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
+#include "gp2/training/default_hyperparameters.hpp"
 #include "inference/nonlinear_motion.hpp"
 #include "jobs/acting_states.hpp"
 #include "jobs/rate_check.hpp"
@@ -67,11 +68,29 @@ void check_priors(const System& system, std::vector<Finding>& findings) {
   }
 }
 
+// Parameters marked for a fit that it refuses to estimate.
+void check_marks(const Model& model, std::vector<Finding>& findings) {
+  std::vector<std::string> marked;
+  for (const Parameter& parameter : model.system->parameters()) {
+    if (parameter.estimate) marked.push_back(parameter.name);
+  }
+  if (marked.empty()) return;
+  const Prior prior = make_prior(model);
+  for (const std::string& name : marked) {
+    try {
+      require_estimable(prior, name);
+    } catch (const InputError& error) {
+      findings.push_back({Level::error, error.what()});
+    }
+  }
+}
+
 void check_model(const Model& model, std::vector<Finding>& findings) {
   const System& system = *model.system;
   findings.push_back({Level::good, fmt::format("{}: '{}', {}, {}", model.name, system.name(), counted(system.nq(), "coordinate"),
                                                counted(system.nc(), "constraint"))});
   check_priors(system, findings);
+  check_marks(model, findings);
   if (!model.robot) return;
   for (const std::string& note : model.robot->notes) findings.push_back({Level::good, note});
 }
@@ -308,9 +327,8 @@ void check_potential(const Model& model, const Eigen::MatrixXd& states, std::vec
     std::vector<int> compared;
     for (int i = 0; i < force.cols(); ++i) {
       if (system.nc() > 0 && values.A(i).allFinite()) {
-        const auto rows = values.A(i).completeOrthogonalDecomposition();
-        force.col(i) -= rows.solve(values.A(i) * force.col(i));
-        admitted_slope.col(i) -= rows.solve(values.A(i) * slope.col(i));
+        force.col(i) -= least_squares(values.A(i), values.A(i) * force.col(i));
+        admitted_slope.col(i) -= least_squares(values.A(i), values.A(i) * slope.col(i));
       }
       constexpr double rounding = 1e-9;
       const double size = force.col(i).norm(), of_all = values.F(i).norm() + slope.col(i).norm();
@@ -355,8 +373,7 @@ bool is_led(const System& system, const Eigen::MatrixXd& states, int j) {
     for (int i = 0; is_led_everywhere && i < values.n_states(); ++i) {
       constexpr double rounding = 1e-9;
       const Eigen::MatrixXd rows = values.A(i).transpose();
-      is_led_everywhere =
-          rows.allFinite() && (rows * rows.completeOrthogonalDecomposition().solve(unit) - unit).norm() < rounding;
+      is_led_everywhere = rows.allFinite() && (rows * least_squares(rows, unit) - unit).norm() < rounding;
     }
   });
   return is_led_everywhere;
@@ -398,6 +415,24 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   }
 }
 
+// Whether a constraint of positions that the log obeys counts the turns of coordinate j, as a gear's does: it is linear in it.
+bool counts_turns(const System& system, const Eigen::MatrixXd& states, int j) {
+  const auto residuals_after = [&](double radians) {
+    Eigen::MatrixXd turned = states;
+    turned.row(system.layout().q(j)).array() += radians;
+    return system.residuals(turned, system.parameter_values());
+  };
+  const Eigen::MatrixXd here = residuals_after(0), once = residuals_after(1) - here, twice = residuals_after(2) - here;
+  for (std::size_t k = 0; k < system.residual_labels().size(); ++k) {
+    constexpr double rounding = 1e-6;
+    const auto c = here.row(static_cast<Eigen::Index>(k)).array(), slope = once.row(static_cast<Eigen::Index>(k)).array();
+    const auto bend = twice.row(static_cast<Eigen::Index>(k)).array() - 2 * slope;
+    if (system.residual_labels()[k].velocity) continue;
+    if ((bend.abs() < rounding * slope.abs() && c.abs() < slope.abs()).all()) return true;
+  }
+  return false;
+}
+
 // An angle that turns forth and back by more than half a turn from row to row, as one in degrees does; a wheel turns one way.
 void check_turns(const WholeLog& log, const System& system, int j, std::vector<Finding>& findings) {
   constexpr double often = 0.2;  // of the rows
@@ -413,6 +448,7 @@ void check_turns(const WholeLog& log, const System& system, int j, std::vector<F
     back += turned < -std::numbers::pi ? 1 : 0;
   }
   if (forth == 0 || back == 0 || static_cast<double>(forth + back) < often * static_cast<double>(n)) return;
+  if (counts_turns(system, log.states, j)) return;
   findings.push_back(
       {Level::warning, fmt::format("{} moves by more than half a turn from row to row, back and forth, at {} of {} rows{}: is it "
                                    "in rad, and sampled often enough?",
@@ -437,6 +473,8 @@ void check_values(const WholeLog& log, const System& system, std::vector<Finding
     add(Level::warning, accelerations[static_cast<std::size_t>(j)], log.accelerations.row(j),
         "a sensor at the end of its range?");
     const Coordinate& coordinate = system.coordinates()[static_cast<std::size_t>(j)];
+    if (auto text = clipped_velocity(coordinate.velocity(), log.states.row(layout.dq(j)), log.accelerations.row(j)))
+      findings.push_back({Level::warning, *std::move(text)});
     const auto q = log.states.row(layout.q(j));
     if (!coordinate.angle) continue;
     if (!is_wrapped_in_degrees({q.begin(), q.end()})) {
@@ -459,6 +497,8 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
   check_values(log, system, findings);
   double unit_of_time = 1;
   for (std::string& text : wrong_rates(system, log.states, log.accelerations, log.reads_time, &unit_of_time))
+    findings.push_back({Level::warning, std::move(text)});
+  for (std::string& text : single_wrong_values(system, log.states, log.accelerations, unit_of_time))
     findings.push_back({Level::warning, std::move(text)});
   const std::vector<bool> all_read(static_cast<std::size_t>(system.layout().size()), true);
   if (std::optional<std::string> text = text_of_late_inputs(system, all_read, model.actuators, unit_of_time)) {

@@ -505,88 +505,103 @@ void note_unexplained(const std::vector<std::string>& inputs, double gain, std::
       is_one ? "" : "s", fmt::join(inputs, ", "), is_one ? "does" : "do", gain));
 }
 
-// A wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be.
-Doubts note_doubts(const Doubted& doubted, std::vector<Observations> observations, std::vector<InputEffect> inputs,
-                   bool asks_logs, std::vector<std::string>& notes) {
-  const Cost cost = cost_under(doubted.posterior.prior(), doubted.posterior.values());
-  constexpr double several = 10;  // times what stays unexplained
+// What the data deny most: a log, else an input; neither where nothing stands out.
+struct MostDoubtful {
+  double gain = least_gain;
+  std::optional<std::size_t> input = {}, log = {};
+  std::vector<Hypothesis> doubts = {};  // of the input
+};
+
+MostDoubtful most_doubtful(const std::vector<InputEffect>& inputs, const std::vector<Observations>& observations, bool asks_logs,
+                           double as_logged, const Cost& cost) {
+  MostDoubtful most;
+  for (std::size_t k = 0; k < inputs.size(); ++k) {
+    std::vector<Hypothesis> of_one = doubts_of(inputs[k], observations, as_logged, cost);
+    if (!of_one.empty() && of_one.front().gain > most.gain) most = {of_one.front().gain, k, {}, std::move(of_one)};
+  }
+  for (std::size_t g = 0; g < observations.size() && asks_logs; ++g) {
+    if (!can_contradict(observations, g)) continue;
+    const double of_one = gain_of_contradiction(observations, g, as_logged, cost);
+    if (!(of_one > most.gain)) continue;
+    most.gain = of_one;
+    most.log = g;
+  }
+  return most;
+}
+
+// What is said of the inputs that the data deny.
+struct Claims {
   struct Claim {
     std::string name;
     Hypothesis explanation;
     double gain;  // before latents and noise were fitted anew
   };
-  std::vector<Claim> claims;
-  std::vector<std::string> unexplained;
-  double unexplained_gain = 0, least_claim = 0;
+  std::vector<Claim> explained = {};
+  std::vector<std::string> unexplained = {};
+  double unexplained_gain = 0;
+  double least = 0;  // gain of a claim: what is wrong elsewhere may be all that speaks for one
+
+  void leave_unexplained(const Claim& claim) {
+    if (claim.explanation.input == known_force) return;
+    unexplained.push_back(claim.name);
+    unexplained_gain = std::max(unexplained_gain, claim.gain);
+  }
+
+  Doubts add_notes(const std::vector<std::string>& held, std::vector<std::string>& notes) {
+    Doubts noted;
+    for (const Claim& claim : explained) {
+      if (claim.gain < least) {
+        leave_unexplained(claim);
+        continue;
+      }
+      const std::string instead =
+          held.empty() ? "" : fmt::format("; or {}, held by a bound or a prior, is wrong", fmt::join(held, ", "));
+      notes.push_back(
+          fmt::format("warning: the data contradict the {}: they are most likely if {}, by {:.2g} in log likelihood. {}",
+                      (claim.explanation.input == known_force ? "" : "input ") + claim.name, claim.explanation.text,
+                      claim.explanation.gain, claim.explanation.cause + instead));
+      if (claim.explanation.kind == Hypothesis::Kind::late) noted.delays.push_back(notes.back());
+    }
+    note_unexplained(unexplained, unexplained_gain, notes);
+    if (!unexplained.empty()) noted.unexplained = notes.back();
+    return noted;
+  }
+};
+
+// A wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be.
+Doubts note_doubts(const Doubted& doubted, std::vector<Observations> observations, std::vector<InputEffect> inputs,
+                   bool asks_logs, std::vector<std::string>& notes) {
+  const Cost cost = cost_under(doubted.posterior.prior(), doubted.posterior.values());
+  constexpr double several = 10;  // times what stays unexplained
+  Claims claims;
   for (;;) {
     const double as_logged = cost(observations);
     if (std::isinf(as_logged)) throw NumericalError("some of the rows alone have no posterior mean");
-    std::vector<Hypothesis> doubts;
-    double gain = least_gain;
-    std::ptrdiff_t of_input = -1, of_log = -1;
-    for (std::size_t k = 0; k < inputs.size(); ++k) {
-      std::vector<Hypothesis> of_one = doubts_of(inputs[k], observations, as_logged, cost);
-      if (of_one.empty() || !(of_one.front().gain > gain)) continue;
-      doubts = std::move(of_one);
-      gain = doubts.front().gain;
-      of_input = static_cast<std::ptrdiff_t>(k);
-    }
-    for (std::size_t g = 0; g < observations.size() && asks_logs; ++g) {
-      if (!can_contradict(observations, g)) continue;
-      const double of_one = gain_of_contradiction(observations, g, as_logged, cost);
-      if (!(of_one > gain)) continue;
-      gain = of_one;
-      of_log = static_cast<std::ptrdiff_t>(g);
-    }
-    if (of_log >= 0) {
-      note_contradiction(doubted.posterior, static_cast<std::size_t>(of_log), gain, notes);
-      observations = with_log(observations, static_cast<std::size_t>(of_log), /*alone=*/false);
-    } else if (of_input >= 0) {
-      const InputEffect input = inputs[static_cast<std::size_t>(of_input)];
-      const auto explanation = explanation_of(doubted, observations, input, doubts, inputs, as_logged, cost);
-      const auto about = std::ranges::find(inputs, explanation ? explanation->input : input.input, &InputEffect::input);
-      if (explanation) {
-        claims.push_back({about->input == input.input ? input.name : about->name, *explanation, gain});
-      } else {
-        least_claim = std::max(least_claim, several * gain);
-      }
-      if (!explanation && input.input != known_force) {
-        unexplained.push_back(input.name);
-        unexplained_gain = std::max(unexplained_gain, gain);
-      }
-      if (explanation || input.input != known_force)
-        observations = without_change(observations, explanation ? explanation->change : doubts.front().change, 1);
-      // what else is said of it is said of an input that acts so
-      const auto is_said = [said = about->input, &explanation](int one) {
-        return one == said || (explanation && one == explanation->other);
-      };
-      std::erase_if(inputs, [&](const InputEffect& one) { return is_said(one.input); });
-      for (InputEffect& one : inputs) std::erase_if(one.exchanged, [&](const Hypothesis& with) { return is_said(with.other); });
-    } else {
-      break;
-    }
-  }
-  Doubts noted;
-  // what is wrong elsewhere may be all that speaks for a claim
-  for (const Claim& claim : claims) {
-    if (claim.gain < least_claim) {
-      if (claim.explanation.input != known_force) {
-        unexplained.push_back(claim.name);
-        unexplained_gain = std::max(unexplained_gain, claim.gain);
-      }
+    const MostDoubtful most = most_doubtful(inputs, observations, asks_logs, as_logged, cost);
+    if (most.log) {
+      note_contradiction(doubted.posterior, *most.log, most.gain, notes);
+      observations = with_log(observations, *most.log, /*alone=*/false);
       continue;
     }
-    const std::string instead =
-        doubted.held.empty() ? "" : fmt::format("; or {}, held by a bound or a prior, is wrong", fmt::join(doubted.held, ", "));
-    notes.push_back(
-        fmt::format("warning: the data contradict the {}: they are most likely if {}, by {:.2g} in log likelihood. {}",
-                    (claim.explanation.input == known_force ? "" : "input ") + claim.name, claim.explanation.text,
-                    claim.explanation.gain, claim.explanation.cause + instead));
-    if (claim.explanation.kind == Hypothesis::Kind::late) noted.delays.push_back(notes.back());
+    if (!most.input) break;
+    const InputEffect input = inputs[*most.input];
+    const auto explanation = explanation_of(doubted, observations, input, most.doubts, inputs, as_logged, cost);
+    const int about = explanation ? explanation->input : input.input;
+    if (explanation) {
+      const std::string& name = about == input.input ? input.name : std::ranges::find(inputs, about, &InputEffect::input)->name;
+      claims.explained.push_back({name, *explanation, most.gain});
+    } else {
+      claims.leave_unexplained({input.name, most.doubts.front(), most.gain});
+      claims.least = std::max(claims.least, several * most.gain);
+    }
+    if (explanation || input.input != known_force)
+      observations = without_change(observations, explanation ? explanation->change : most.doubts.front().change, 1);
+    // what else is said of it is said of an input that acts so
+    const auto is_said = [&](int one) { return one == about || (explanation && one == explanation->other); };
+    std::erase_if(inputs, [&](const InputEffect& one) { return is_said(one.input); });
+    for (InputEffect& one : inputs) std::erase_if(one.exchanged, [&](const Hypothesis& with) { return is_said(with.other); });
   }
-  note_unexplained(unexplained, unexplained_gain, notes);
-  if (!unexplained.empty()) noted.unexplained = notes.back();
-  return noted;
+  return claims.add_notes(doubted.held, notes);
 }
 
 }  // namespace

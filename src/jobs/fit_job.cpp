@@ -598,6 +598,106 @@ FitRun run_for_what_rows_are_worth(const FitJob& job, const std::function<void(c
   }
 }
 
+std::vector<Option> options_of_data(FitRequest& request) {
+  FitProblemOptions& problem = request.problem;
+  return in_group(
+      "Data",
+      {
+          {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of the values in `also`",
+           "for accelerations: the model's [noise]"},
+          {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
+          columns_option(problem.columns, "columns by other names, in all logs; theta1=q3 also maps dtheta1 and ddtheta1"),
+          {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
+           "those with a column NAME_std in the log, or all"},
+          {"noise_std",
+           NumberOrWord{&problem.noise_stddev, {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}},
+           "S", "noise standard deviation of every observed ddq; estimate: estimate it; stated: use the log's NAME_std unchanged",
+           "the log's NAME_std times an estimated factor, else the model's [noise]"},
+          {"max_points", &problem.max_points, "N",
+           "maximum number of rows per log, chosen at random by `seed`; of a raw log those that cover the motion best, or "
+           "the number of states with windows",
+           "all; raw log: 200, or 600 with windows"},
+          {"thin", Switch{&request.thin, "auto", "none"}, "",
+           "what to do if residuals are correlated from row to row; auto: refit to every k-th row, so that they are nearly "
+           "uncorrelated; none: keep all rows"},
+          {"project", &problem.project, "",
+           "first project states onto the position and velocity constraints, with the model's parameter values"},
+          {"robust", &problem.robust, "", "give outliers a larger noise, and list them (docs/command-line.md)"},
+      });
+}
+
+std::vector<Option> options_of_prior(FitProblemOptions& problem) {
+  return in_group(
+      "What is learned",
+      {
+          {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
+           "prior mean of the unconstrained acceleration; force: M⁻¹F of the model"},
+          {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
+           "whether the model's latent acts on accelerations or forces", "as in the model"},
+          {"baseline",
+           choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}), "",
+           "learn ddq without mechanics (docs/priors.md), from the features and all state entries that the model reads; se: "
+           "independent outputs; icm, lmc: multi-output"},
+          {"estimate", &problem.estimate, "p1,p2", "parameters to estimate; `estimate=none`: none", "those marked in the model"},
+          {"protocol", choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}),
+           "", "initial values and bounds of hyperparameters (docs/priors.md); paper: as in Geist & Trimpe 2020"},
+          {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
+           "hyper-priors; default: weak, log-normal; none: maximum likelihood within the same bounds"},
+          {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
+           "whether to add a small latent for effects that the kernels cannot represent (docs/priors.md)"},
+      });
+}
+
+std::vector<Option> options_of_training(FitRequest& request) {
+  FitProblemOptions& problem = request.problem;
+  return in_group(
+      "How it is learned",
+      {
+          {"restarts", &request.restarts, "R", "number of optimiser runs; the first starts at the model's values",
+           "5; baseline: 30"},
+          {"max_iterations", &request.max_iterations, "K",
+           "maximum iterations per run, including those after an escape; 0: no optimisation, condition at the starting "
+           "values"},
+          {"max_escapes", &request.max_escapes, "K",
+           "maximum number of escapes: scans for a lower optimum that start at the best one", "5"},
+          {"gradient_tolerance", &request.gradient_tolerance, "G",
+           "stop when the largest entry of the projected gradient is below this", "1e-5"},
+          {"reduction_tolerance", &request.reduction_tolerance, "R",
+           "stop when the relative reduction of the objective in an iteration is below this", "1e-12; baseline: 1e-9"},
+          {"start", &request.start, "FILE", "starting values: a JSON file {\"name\": value, …} or a FIT.json"},
+          {"seed", &problem.seed, "S", "random seed of restarts and `max_points`"},
+          {"hyperparameters",
+           choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
+                                            {"integrate", HyperparameterChoice::integrate},
+                                            {"auto", HyperparameterChoice::automatic}}),
+           "",
+           fmt::format(
+               "point estimate or posterior of the hyperparameters; optimise: the most probable values; integrate: sample "
+               "the posterior and mix the predictions of {} draws (docs/theory.md, T31), {} with inducing points, at about "
+               "{} evaluations of the likelihood; auto: integrate if a latent has lengthscales per direction, as in the "
+               "default prior, or is a potential, and rows times degrees of freedom are at most {}",
+               n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
+          {"standard_errors", YesByDefault{&request.standard_errors}, "",
+           "standard errors of estimated parameters, which cost a few dozen gradients"},
+          {"inducing", NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}},
+           "M",
+           fmt::format("maximum number of inducing variables, each one function of a latent at one point (docs/theory.md, "
+                       "T37); the time is proportional to the number of rows. none: exact; auto: exact up to {} rows times "
+                       "degrees of freedom, beyond that at most {} variables, fewer for more than 100 000 rows",
+                       largest_exact_size, most_inducing_variables),
+           "auto"},
+          {"train_on", &request.train_on, "N",
+           "find hyperparameters and parameters from N rows, evenly spaced over all logs together, then condition on all "
+           "rows; fast, but standard deviations may be too small",
+           "all rows"},
+          threads_option(request.threads),
+          not_recorded({"checkpoint", &request.checkpoint, "FILE",
+                        "FIT.json with the best result so far, rewritten after each run that improves it and every few "
+                        "seconds during such a run; resume with `start` (docs/command-line.md)",
+                        "none"}),
+      });
+}
+
 }  // namespace
 
 int automatic_inducing_variables(std::int64_t n_rows) {
@@ -606,103 +706,7 @@ int automatic_inducing_variables(std::int64_t n_rows) {
 }
 
 std::vector<Option> options(FitRequest& request) {
-  FitProblemOptions& problem = request.problem;
-  return joined({
-      in_group(
-          "Data",
-          {
-              {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of the values in `also`",
-               "for accelerations: the model's [noise]"},
-              {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
-              columns_option(problem.columns, "columns by other names, in all logs; theta1=q3 also maps dtheta1 and ddtheta1"),
-              {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
-               "those with a column NAME_std in the log, or all"},
-              {"noise_std",
-               NumberOrWord{&problem.noise_stddev,
-                            {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}},
-               "S",
-               "noise standard deviation of every observed ddq; estimate: estimate it; stated: use the log's NAME_std unchanged",
-               "the log's NAME_std times an estimated factor, else the model's [noise]"},
-              {"max_points", &problem.max_points, "N",
-               "maximum number of rows per log, chosen at random by `seed`; of a raw log those that cover the motion best, or "
-               "the number of states with windows",
-               "all; raw log: 200, or 600 with windows"},
-              {"thin", Switch{&request.thin, "auto", "none"}, "",
-               "what to do if residuals are correlated from row to row; auto: refit to every k-th row, so that they are nearly "
-               "uncorrelated; none: keep all rows"},
-              {"project", &problem.project, "",
-               "first project states onto the position and velocity constraints, with the model's parameter values"},
-              {"robust", &problem.robust, "", "give outliers a larger noise, and list them (docs/command-line.md)"},
-          }),
-      in_group(
-          "What is learned",
-          {
-              {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
-               "prior mean of the unconstrained acceleration; force: M⁻¹F of the model"},
-              {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
-               "whether the model's latent acts on accelerations or forces", "as in the model"},
-              {"baseline",
-               choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}),
-               "",
-               "learn ddq without mechanics (docs/priors.md), from the features and all state entries that the model reads; se: "
-               "independent outputs; icm, lmc: multi-output"},
-              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate; `estimate=none`: none",
-               "those marked in the model"},
-              {"protocol",
-               choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
-               "initial values and bounds of hyperparameters (docs/priors.md); paper: as in Geist & Trimpe 2020"},
-              {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
-               "hyper-priors; default: weak, log-normal; none: maximum likelihood within the same bounds"},
-              {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
-               "whether to add a small latent for effects that the kernels cannot represent (docs/priors.md)"},
-          }),
-      in_group(
-          "How it is learned",
-          {
-              {"restarts", &request.restarts, "R", "number of optimiser runs; the first starts at the model's values",
-               "5; baseline: 30"},
-              {"max_iterations", &request.max_iterations, "K",
-               "maximum iterations per run, including those after an escape; 0: no optimisation, condition at the starting "
-               "values"},
-              {"max_escapes", &request.max_escapes, "K",
-               "maximum number of escapes: scans for a lower optimum that start at the best one", "5"},
-              {"gradient_tolerance", &request.gradient_tolerance, "G",
-               "stop when the largest entry of the projected gradient is below this", "1e-5"},
-              {"reduction_tolerance", &request.reduction_tolerance, "R",
-               "stop when the relative reduction of the objective in an iteration is below this", "1e-12; baseline: 1e-9"},
-              {"start", &request.start, "FILE", "starting values: a JSON file {\"name\": value, …} or a FIT.json"},
-              {"seed", &problem.seed, "S", "random seed of restarts and `max_points`"},
-              {"hyperparameters",
-               choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
-                                                {"integrate", HyperparameterChoice::integrate},
-                                                {"auto", HyperparameterChoice::automatic}}),
-               "",
-               fmt::format(
-                   "point estimate or posterior of the hyperparameters; optimise: the most probable values; integrate: sample "
-                   "the posterior and mix the predictions of {} draws (docs/theory.md, T31), {} with inducing points, at about "
-                   "{} evaluations of the likelihood; auto: integrate if a latent has lengthscales per direction, as in the "
-                   "default prior, or is a potential, and rows times degrees of freedom are at most {}",
-                   n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
-              {"standard_errors", YesByDefault{&request.standard_errors}, "",
-               "standard errors of estimated parameters, which cost a few dozen gradients"},
-              {"inducing",
-               NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
-               fmt::format("maximum number of inducing variables, each one function of a latent at one point (docs/theory.md, "
-                           "T37); the time is proportional to the number of rows. none: exact; auto: exact up to {} rows times "
-                           "degrees of freedom, beyond that at most {} variables, fewer for more than 100 000 rows",
-                           largest_exact_size, most_inducing_variables),
-               "auto"},
-              {"train_on", &request.train_on, "N",
-               "find hyperparameters and parameters from N rows, evenly spaced over all logs together, then condition on all "
-               "rows; fast, but standard deviations may be too small",
-               "all rows"},
-              threads_option(request.threads),
-              not_recorded({"checkpoint", &request.checkpoint, "FILE",
-                            "FIT.json with the best result so far, rewritten after each run that improves it and every few "
-                            "seconds during such a run; resume with `start` (docs/command-line.md)",
-                            "none"}),
-          }),
-  });
+  return joined({options_of_data(request), options_of_prior(request.problem), options_of_training(request)});
 }
 
 void require_use_of_commands(const FitRequest& request) {
@@ -794,6 +798,7 @@ FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
                                           log.name, log.bytes, log.rows, named->bytes, named->rows));
   }
   for (const LogFile& log : fit.logs) {
+    if (log.checksum.empty()) continue;  // rows of arrays
     if (!job.file.has_learned(log) && std::ranges::find(job.file.logs, log.name, &LogFile::name) == job.file.logs.end()) {
       job.notes.push_back(fmt::format("warning: {}, a log of the fit, is not given", log.name));
     }

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <map>
 #include <optional>
-#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -69,6 +68,11 @@ void add_pile_up_notes(const std::vector<Observations>& observations, const Syst
       const std::string name = fmt::format("warning: {}{}", names[static_cast<std::size_t>(k)], of_log);
       if (auto text = pile_up_text(name, group.values().row(k), "a sensor at the end of its range?"))
         notes.push_back(*std::move(text));
+      const int j = view.rows[static_cast<std::size_t>(k)];
+      const std::string velocity = system.coordinates()[static_cast<std::size_t>(j)].velocity();
+      if (auto text = clipped_velocity(fmt::format("warning: {}{}", velocity, of_log), group.states().row(system.layout().dq(j)),
+                                       group.values().row(k)))
+        notes.push_back(*std::move(text));
     }
   }
 }
@@ -131,15 +135,10 @@ void add_constraint_residual_notes(const Posterior& posterior, const TrustedData
   for (std::size_t g = 0; g < trusted.observations.size(); ++g) {
     if (!trusted.observations[g].view().is_of_ddq()) continue;
     const std::string of_log = trusted.observations.size() > 1 ? fmt::format("log {}: ", g + 1) : "";
-    const bool has_lines = g < trusted.lines.size() && !trusted.lines[g].empty();
     for (ConstraintResidual& one : residuals_against_constraints(posterior, trusted, g)) {
       if (!one.is_too_large()) continue;
-      for (int& state : one.worst)  // text() writes each plus 1
-        if (has_lines) state = trusted.lines[g][static_cast<std::size_t>(state)] - 1;
-      std::string text = one.text();
-      constexpr std::string_view row = "off: row ", line = "off: line ";
-      if (has_lines) text.replace(text.find(row), row.size(), line);
-      notes.push_back(fmt::format("warning: {}{}", of_log, text));
+      if (g < trusted.lines.size()) one.lines = trusted.lines[g];
+      notes.push_back(fmt::format("warning: {}{}", of_log, one.text()));
     }
   }
 }

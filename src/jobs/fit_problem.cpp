@@ -551,15 +551,15 @@ void read_start(const NamedNumbers& start, int max_iterations, const std::vector
   };
   const auto read = [&] {
     std::map<std::string, double> others;
+    std::vector<std::string> names;
+    for (const auto& [name, value] : known) names.push_back(name);
     if (start.file.empty()) {
       std::map<std::string, double> values = start.values;
-      for (const auto& [name, value] : known) {
+      for (const std::string& name : names) {
         if (auto of_actuator = values.extract(name)) others.insert(std::move(of_actuator));
       }
-      set_start_values(values, source, problem.hyperparameters);
+      set_start_values(values, source, problem.hyperparameters, names);
     } else {
-      std::vector<std::string> names;
-      for (const auto& [name, value] : known) names.push_back(name);
       others = read_start_values(start.file, problem.hyperparameters, names);
     }
     const System& system = *problem.prior.system;
@@ -618,9 +618,14 @@ std::vector<std::string> notes_of(const FitReport& report, const Posterior& post
                     "lacks something",
                     h.name, h.value));
   }
+  const auto is_open = [&](const Hyperparameter& h) {
+    return h.is_system_parameter() && report.uncertainty &&
+           std::isinf(report.uncertainty->stddev[&h - report.hyperparameters.data()]);
+  };
+  const auto n_open = std::ranges::count_if(report.hyperparameters, is_open);
   for (const Hyperparameter& h : report.hyperparameters) {
     if (!h.is_system_parameter() || !h.at_bound() || never_ran) continue;
-    if (report.uncertainty && std::isinf(report.uncertainty->stddev[&h - report.hyperparameters.data()])) continue;  // by chance
+    if (n_open > 1 && is_open(h)) continue;  // another may make up for it, so that it is there by chance
     notes.push_back(
         fmt::format("warning: {} ended at its bound, {:.6g}. It may lie beyond, or the model lacks something", h.name, h.value));
   }

@@ -26,8 +26,12 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 
-// Text that is the same is the same system; functions cannot be compared, but the system that they made can.
-bool is_same(const Model& a, const Model& b) { return a.system == b.system || (!a.code && !b.code && a.text == b.text); }
+// Text that is the same is the same system if the robot that it names is too; functions cannot be compared, but the system that they
+// made can.
+bool is_same(const Model& a, const Model& b) {
+  const auto robot_of = [](const Model& model) { return model.robot ? to_json(*model.robot) : ""; };
+  return a.system == b.system || (!a.code && !b.code && a.text == b.text && robot_of(a) == robot_of(b));
+}
 
 void set_time_step(View& view, const std::optional<double>& time_step) {
   const bool needs_step = view.quantity->needs_time_step();
@@ -114,18 +118,6 @@ Posterior with_equal_directions(const Posterior& posterior) {
   }
   values.inducing = nullptr;
   return {posterior.prior(), evenly(posterior.observations(), enough / posterior.prior().system->nq()), std::move(values)};
-}
-
-// Warns of delays and lags in another unit than t, and returns what else the rates of a log say of its columns.
-std::vector<std::string> note_late_inputs(const PredictedView& at, const CsvTable& log,
-                                          const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
-  const System& system = *at.model->system;
-  double unit_of_time = 1;
-  std::vector<std::string> wrong =
-      wrong_rates_of(system, at.prior, log, checked_columns(*at.model, {&log}, columns), &unit_of_time);
-  if (const auto text = text_of_late_inputs(system, at.prior.reads(), without_estimates(at.actuators), unit_of_time))
-    notes.push_back(fmt::format("warning: {}: {}", log.name(), *text));
-  return wrong;
 }
 
 PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior, const CsvTable& table,
@@ -376,7 +368,10 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
   LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators,
                                   parameters_of(at.view, posterior.values().parameters));
-  if (!std::ranges::all_of(at.actuators, &Actuator::is_direct)) note_late_inputs(at, states, request.columns, log.notes);
+  if (!std::ranges::all_of(at.actuators, &Actuator::is_direct)) {
+    note_late_inputs(at.prior, states, checked_columns(*at.model, {&states}, request.columns), without_estimates(at.actuators),
+                     log.notes);
+  }
   const std::string name = states.name();
   states = CsvTable();  // a long log in memory once
   PredictOutcome out{at.names, {}, std::move(log.notes)};
@@ -444,7 +439,8 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTabl
                                            parameters_of(at.view, posterior.values().parameters));
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   const std::string name = log.name();
-  for (const std::string& text : note_late_inputs(at, log, request.columns, out.notes))
+  for (const std::string& text : note_late_inputs(at.prior, log, checked_columns(*at.model, {&log}, request.columns),
+                                                  without_estimates(at.actuators), out.notes))
     out.notes.push_back(fmt::format("warning: {}: {}", name, text));
   add_learned_note(fit, log, out.notes);
   log = CsvTable();

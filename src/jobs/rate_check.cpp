@@ -5,13 +5,13 @@
 #include <cmath>
 #include <functional>
 #include <iterator>
+#include <limits>
 #include <numbers>
 #include <optional>
 #include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <Eigen/Eigenvalues>
 
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
@@ -35,11 +35,12 @@ constexpr double worth_a_word = 0.1;  // share of a rate
 constexpr double few_tell = 0.3;      // the same, of fewer steps than enough: their deviation is hardly known
 constexpr double surely_apart = 5;    // deviations
 
-// What nine of ten numbers are not above, by size.
+// What nine of ten numbers are not above, by size; NaN does not count.
 double most_are_below(const ArrayXd& numbers) {
-  if (numbers.size() == 0) return 0;
-  std::vector<double> sizes(static_cast<std::size_t>(numbers.size()));
-  ArrayXd::Map(sizes.data(), numbers.size()) = numbers.abs();
+  std::vector<double> sizes;
+  for (const double number : numbers)
+    if (!std::isnan(number)) sizes.push_back(std::abs(number));
+  if (sizes.empty()) return 0;
   const auto at = sizes.begin() + static_cast<std::ptrdiff_t>(0.9 * static_cast<double>(sizes.size() - 1));
   std::nth_element(sizes.begin(), at, sizes.end());
   return *at;
@@ -100,12 +101,27 @@ class RateRows {
   /// Whether so many rows are so long a time.
   [[nodiscard]] bool are_regular() const { return 10 * ((lengths_ / usual_length_ - 1).abs() > 0.1).count() < lengths_.size(); }
 
+  /// By how much the value changes, from each row over so many steps, beyond what its rates at the first and the last row say. NaN
+  /// over a pause.
+  [[nodiscard]] ArrayXd unexplained(Index n_steps) const {
+    const RowVectorXd& rate = columns_.rates[columns_.own];
+    ArrayXd out(changes_.size() + 1 - n_steps);
+    for (Index i = 0; i < out.size(); ++i) {
+      double time = 0;
+      for (Index k = i; k < i + n_steps; ++k) time += length(k);
+      out[i] = changes_.segment(i, n_steps).sum() - 0.5 * (rate[i] + rate[i + n_steps]) * time;
+    }
+    return out;
+  }
+
   /// @param lag  rows by which the rate is late
   [[nodiscard]] Steps steps(std::size_t rate, Index lag, Index rows) const {
     const RowVectorXd& r = columns_.rates[rate];
     const bool jumps = columns_.just_before != nullptr && rate == columns_.own;
     const RowVectorXd& to = jumps ? *columns_.just_before : r;
-    const Index first = std::max<Index>(0, -lag), end = changes_.size() - std::max<Index>(0, lag);
+    // every lag cuts the changes into the same steps, among which a wrong value counts alike
+    const Index first = (std::max<Index>(0, -lag) + rows - 1) / rows * rows;
+    const Index end = changes_.size() - std::max<Index>(0, lag);
     Steps steps;
     for (ArrayXd* const one : {&steps.y, &steps.x, &steps.d, &steps.h}) one->resize(changes_.size() / rows);
     Index n = 0;
@@ -132,9 +148,8 @@ class RateRows {
     constexpr double far = 4;
     const auto rate = columns_.rates[columns_.own].transpose().array();
     const Index n = changes_.size();
-    const ArrayXd unexplained = (changes_ - 0.5 * (rate.head(n) + rate.tail(n)) * lengths_).abs();
-    const ArrayXd known = unexplained.isNaN().select(0.0, unexplained);
-    lengths_ = (known > far * most_are_below(known)).select(not_a_number, lengths_);
+    const ArrayXd beyond_rate = (changes_ - 0.5 * (rate.head(n) + rate.tail(n)) * lengths_).abs();
+    lengths_ = (beyond_rate > far * most_are_below(beyond_rate)).select(not_a_number, lengths_);
   }
 
   /// NaN where the log pauses, or begins anew, and at impacts
@@ -226,13 +241,15 @@ std::string unrelated(const Steps& steps) {
   constexpr double much = 0.1, lasting = 0.5;  // share of the squares; correlation from step to step
   const double unexplained = 1 - std::pow(steps.correlation(), 2);
   if (steps.n() < enough_steps || !(unexplained > much)) return "";
-  Eigen::MatrixX2d both(steps.n(), 2);
-  both << steps.y.matrix().normalized(), steps.x.matrix().normalized();
-  const Index n = steps.n() - 1;
-  const Eigen::Matrix2d at_once = both.transpose() * both, next = both.topRows(n).transpose() * both.bottomRows(n);
-  const Eigen::GeneralizedSelfAdjointEigenSolver<Eigen::Matrix2d> least((next + next.transpose()) / 2, at_once,
-                                                                        Eigen::EigenvaluesOnly);
-  if (!(least.eigenvalues()[0] > lasting)) return "";
+  const auto to_next = [](const ArrayXd& a, const ArrayXd& b) {
+    return (a.head(a.size() - 1) * b.tail(b.size() - 1)).sum() / std::sqrt(a.square().sum() * b.square().sum());
+  };
+  const double yy = to_next(steps.y, steps.y), xx = to_next(steps.x, steps.x);
+  const double yx = (to_next(steps.y, steps.x) + to_next(steps.x, steps.y)) / 2, c = steps.correlation();
+  // the smaller root λ of (yy − λ) (xx − λ) = (yx − c λ)²
+  const double middle = ((yy + xx) / 2 - c * yx) / unexplained;
+  const double least = middle - std::sqrt(std::max(0.0, middle * middle - (yy * xx - yx * yx) / unexplained));
+  if (!(least > lasting)) return "";
   return fmt::format(
       "{:.0f} % of what is measured is neither this rate nor noise: another column, or a sensor that was stuck for a time?",
       100 * unexplained);
@@ -257,15 +274,25 @@ std::string better_rate(const RateColumns& columns) {
     for (std::size_t other = 0; other < columns.rates.size(); ++other) {
       if (other == own || columns.rates[other].hasNaN()) continue;
       const Steps steps = rows.steps(other, 0, length);
-      if (is_sure(steps) && is_better(steps))
+      if (is_sure(steps) && is_better(steps, other))
         return fmt::format("it is measured by the column of {}: swapped?", columns.names[other]);
     }
     return "";
   };
   // of coordinates that move together a wrong column goes along, and noise may hide the right one: the other must be the rate itself
   const auto unexplained = [](const Steps& steps) { return 1 - std::pow(steps.correlation(), 2); };
-  const std::string swapped = other_column([&](const Steps& steps) {
-    return std::abs(steps.slope() - 1) < 0.1 && std::abs(now.slope() - 1) > 0.1 && unexplained(now) > 10 * unexplained(steps);
+  // where they move in a fixed ratio both columns explain the value alike, and each must be the rate of the other coordinate
+  const auto is_rate_of = [&](const Steps& steps) { return is_sure(steps) && std::abs(steps.slope() - 1) < 0.01; };
+  const auto are_exchanged = [&](const Steps& steps, std::size_t other) {
+    if (columns.values == nullptr || (*columns.values)[other].hasNaN() || !is_rate_of(steps)) return false;
+    const RateColumns of_other{columns.t, columns.names[other], (*columns.values)[other], false, columns.rates, columns.names,
+                               own};
+    return is_rate_of(RateRows(of_other).steps(own, 0, length));
+  };
+  const std::string swapped = other_column([&](const Steps& steps, std::size_t other) {
+    constexpr double rounding = 1e-12;
+    return std::abs(steps.slope() - 1) < 0.1 && std::abs(now.slope() - 1) > 0.1 &&
+           (unexplained(now) > 10 * unexplained(steps) + rounding || are_exchanged(steps, other));
   });
   if (!swapped.empty()) return swapped;
   std::optional<Index> lag;
@@ -281,18 +308,19 @@ std::string better_rate(const RateColumns& columns) {
   }
   if (lag) {
     const Steps steps = rows.steps(own, *lag, length);
-    const double tau = static_cast<double>(*lag) * rows.usual_length() + lateness(steps, 0.75 * rows.usual_length()).value_or(0);
+    const double least = 0.75 * rows.usual_length();
+    const double tau = static_cast<double>(*lag) * rows.usual_length() + lateness(steps, least).value_or(0);
     std::vector<std::string> texts;
     if (is_scaled(steps))
       texts.push_back(
           fmt::format("the rate is {:.3g} × the column: {}", steps.slope(), cause_of_factor(steps.slope(), columns.is_angle)));
-    if (tau != 0) {
+    if (std::abs(tau) > least) {
       texts.push_back(fmt::format("the column {} by {:.2g} s, {:.2g} of the log's steps, or {} {}", tau > 0 ? "lags" : "leads",
                                   std::abs(tau), std::abs(tau) / rows.usual_length(), columns.name, tau > 0 ? "leads" : "lags"));
     }
     return fmt::format("{}", fmt::join(texts, "; "));
   }
-  const std::string other = std::abs(now.correlation()) < 0.5 ? other_column([](const Steps&) { return true; }) : "";
+  const std::string other = std::abs(now.correlation()) < 0.5 ? other_column([](const Steps&, std::size_t) { return true; }) : "";
   return other.empty() ? unrelated(now) : other;
 }
 
@@ -325,25 +353,41 @@ MatrixXd just_before_rows(const System& system, const Ref<const MatrixXd>& state
   return {};
 }
 
-std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, const System& system,
-                                          const Ref<const MatrixXd>& states, const Ref<const MatrixXd>& accelerations) {
+// The columns of a log in the order of time.
+struct LoggedRates {
+  RowVectorXd t;
+  std::vector<RowVectorXd> q, dq, ddq;
+  std::vector<std::string> velocities, accelerations;  // their names
+};
+
+// Nothing where t is not known, or goes back at many rows.
+std::optional<LoggedRates> logged_rates(const Ref<const RowVectorXd>& times, const System& system,
+                                        const Ref<const MatrixXd>& states, const Ref<const MatrixXd>& accelerations) {
   const StateLayout layout = system.layout();
   constexpr Index fewest = 30, enough = 300'000;
   const Index n = std::min(states.cols(), enough);
   const RowVectorXd t = times.head(n);
-  if (t.hasNaN() || t.size() < fewest) return {};
+  if (t.hasNaN() || t.size() < fewest) return std::nullopt;
   constexpr Index few = 10;  // one step in so many may go back, as from episode to episode, or stand still
-  if (few * ((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() <= 0).count() > t.size()) return {};
-  std::vector<RowVectorXd> q, dq, ddq;
-  std::vector<std::string> velocities;
+  if (few * ((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() <= 0).count() > t.size()) return std::nullopt;
+  LoggedRates out{t, {}, {}, {}, {}, system.acceleration_names()};
   for (int j = 0; j < system.nq(); ++j) {
-    q.emplace_back(states.row(layout.q(j)).head(n));
-    dq.emplace_back(states.row(layout.dq(j)).head(n));
-    ddq.emplace_back(accelerations.row(j).head(n));
-    velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
+    out.q.emplace_back(states.row(layout.q(j)).head(n));
+    out.dq.emplace_back(states.row(layout.dq(j)).head(n));
+    out.ddq.emplace_back(accelerations.row(j).head(n));
+    out.velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
   }
+  return out;
+}
+
+std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, const System& system,
+                                          const Ref<const MatrixXd>& states, const Ref<const MatrixXd>& accelerations) {
+  const std::optional<LoggedRates> logged = logged_rates(times, system, states, accelerations);
+  if (!logged) return {};
+  const auto& [t, q, dq, ddq, velocities, acceleration_names] = *logged;
   std::optional<MatrixXd> just_before;
   const auto follows_held_inputs = [&](RateColumns columns) {
+    const Index n = columns.t.size();
     if (!just_before) just_before = just_before_rows(system, states.leftCols(n), accelerations.leftCols(n));
     if (just_before->size() == 0) return false;
     const RowVectorXd row = just_before->row(static_cast<Index>(columns.own));
@@ -354,22 +398,132 @@ std::vector<std::string> wrong_rates_over(const Ref<const RowVectorXd>& times, c
   const auto add_if_wrong = [&](const RateColumns& columns) {
     const std::string text = columns.value.hasNaN() ? "" : better_rate(columns);
     if (text.empty()) return false;
-    if (&columns.rates == &ddq && follows_held_inputs(columns)) return false;
+    if (&columns.rates == &logged->ddq && follows_held_inputs(columns)) return false;
     notes.push_back(fmt::format("{} is not the rate of {} over t: {}", columns.names[columns.own], columns.name, text));
     return true;
   };
-  const std::vector<std::string> acceleration_names = system.acceleration_names();
   const bool may_jump = system.has_conditional_constraints();
   for (std::size_t j = 0; j < q.size(); ++j) {
     const Coordinate& coordinate = system.coordinates()[j];
     // a velocity that is wrong says nothing of the acceleration
-    if (!add_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
-      add_if_wrong({t, velocities[j], dq[j], false, ddq, acceleration_names, j, may_jump});
+    if (!add_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j, false, nullptr, &q}))
+      add_if_wrong({t, velocities[j], dq[j], false, ddq, acceleration_names, j, may_jump, nullptr, &dq});
   }
   return notes;
 }
 
+// How the steps to and from a row differ from what the rate of a column says: a wrong value makes them differ to opposite sides, a wrong
+// rate to the same side.
+class StepsAbout {
+ public:
+  explicit StepsAbout(const RateColumns& columns) : value_(columns.value), rate_(columns.rates[columns.own]) {
+    if (value_.hasNaN()) return;
+    const RateRows rows(columns);
+    one_ = rows.unexplained(1), two_ = rows.unexplained(2);
+    usual_ = most_are_below(one_), usual_two_ = most_are_below(two_);
+    step_of_value_ = smallest_step(value_), step_of_rate_ = smallest_step(rate_);
+  }
+
+  [[nodiscard]] bool shows_wrong_value(Index row) const {
+    constexpr double about = 0.05;
+    if (!stands_out(row) || one_[row - 1] * one_[row] > 0) return false;
+    for (const double turn : {2 * std::numbers::pi, 360.0})
+      if (std::abs(std::abs(one_[row]) / turn - 1) < about) return false;  // an angle that wraps
+    return leaps(value_, row, step_of_value_);
+  }
+  [[nodiscard]] bool shows_wrong_rate(Index row) const {
+    return stands_out(row) && one_[row - 1] * one_[row] > 0 && leaps(rate_, row, step_of_rate_);
+  }
+  /// Whether the rows beside it go with each other, as far as is known: at an impact, or where a motion is too fast, they do not.
+  [[nodiscard]] bool go_on_without(Index row) const {
+    constexpr double usually = 5;
+    return one_.size() == 0 || !(std::abs(two_[row - 1]) > usually * usual_two_);
+  }
+
+ private:
+  // Both steps differ far more than most do, and than those beside them; the two together hardly do without the row.
+  [[nodiscard]] bool stands_out(Index row) const {
+    constexpr double far = 50, alone = 2, little = 0.2;
+    if (one_.size() == 0) return false;
+    const double least = std::min(std::abs(one_[row - 1]), std::abs(one_[row]));
+    double beside = 0;
+    for (const Index k : {row - 2, row + 1}) beside = std::max(beside, k < 0 || k >= one_.size() ? 0 : std::abs(one_[k]));
+    return least > std::max(far * usual_, alone * beside) && std::abs(two_[row - 1]) < little * least && go_on_without(row);
+  }
+  // That of an encoder, say.
+  [[nodiscard]] static double smallest_step(const RowVectorXd& column) {
+    double smallest = std::numeric_limits<double>::infinity();
+    for (Index i = 1; i < column.size(); ++i) {
+      const double step = std::abs(column[i] - column[i - 1]);
+      if (step > 0) smallest = std::min(smallest, step);
+    }
+    return smallest;
+  }
+  // Whether a column leaps at a row and back, by many such steps, and farther than beside it, as a body that bounces does not.
+  [[nodiscard]] static bool leaps(const RowVectorXd& column, Index row, double smallest) {
+    constexpr double many = 20, farther = 2;
+    double beside = 0;
+    for (const Index k : {row - 1, row + 2})
+      if (k > 0 && k < column.size()) beside = std::max(beside, std::abs(column[k] - column[k - 1]));
+    const double to = column[row] - column[row - 1], from = column[row + 1] - column[row];
+    return to * from < 0 && std::min(std::abs(to), std::abs(from)) > std::max(many * smallest, farther * beside);
+  }
+
+  const RowVectorXd &value_, &rate_;
+  ArrayXd one_, two_;  // RateRows::unexplained; empty: the value is not known
+  double usual_ = 0, usual_two_ = 0, step_of_value_ = 0, step_of_rate_ = 0;
+};
+
+// Which values of a column are alone wrong, if there are some and they are few.
+std::optional<std::string> single_values_text(const std::string& name, const std::string& other, const RowVectorXd& values,
+                                              const std::vector<Index>& wrong) {
+  constexpr std::ptrdiff_t one_in = 50, most = 5;  // rows, that are named
+  if (wrong.empty() || std::ssize(wrong) > std::max<Index>(1, values.size() / one_in)) return std::nullopt;
+  std::vector<std::string> places;
+  for (const Index row : wrong) {
+    if (std::ssize(places) == most) break;
+    places.push_back(fmt::format("{:.4g} at data row {}", values[row], row + 1));
+  }
+  if (std::ssize(wrong) > most) places.push_back(fmt::format("and {} more", std::ssize(wrong) - most));
+  return fmt::format("single values of {} contradict {} and the rows beside them: {}. Correct them, or leave these rows out",
+                     name, other, fmt::join(places, ", "));
+}
+
 }  // namespace
+
+std::vector<std::string> single_wrong_values(const System& system, const Ref<const MatrixXd>& states,
+                                             const Ref<const MatrixXd>& accelerations, double unit_of_time) {
+  const std::optional<LoggedRates> logged =
+      logged_rates(unit_of_time * states.row(system.layout().t()), system, states, accelerations);
+  if (!logged) return {};
+  const auto& [t, q, dq, ddq, velocities, acceleration_names] = *logged;
+  std::vector<std::string> texts;
+  for (std::size_t j = 0; j < q.size(); ++j) {
+    const Coordinate& coordinate = system.coordinates()[j];
+    const StepsAbout positions({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j});
+    const StepsAbout steps({t, velocities[j], dq[j], false, ddq, acceleration_names, j, system.has_conditional_constraints()});
+    std::vector<Index> of_q, of_dq, of_dq_by_ddq, of_ddq;
+    for (Index row = 1; row + 1 < t.size(); ++row) {
+      if (!positions.go_on_without(row) || !steps.go_on_without(row)) continue;
+      if (positions.shows_wrong_value(row)) of_q.push_back(row);
+      if (steps.shows_wrong_rate(row)) of_ddq.push_back(row);
+      if (positions.shows_wrong_rate(row)) {
+        of_dq.push_back(row);
+      } else if (steps.shows_wrong_value(row)) {
+        of_dq_by_ddq.push_back(row);
+      }
+    }
+    const auto add = [&](const std::string& name, const std::string& other, const RowVectorXd& values,
+                         const std::vector<Index>& wrong) {
+      if (auto text = single_values_text(name, other, values, wrong)) texts.push_back(*std::move(text));
+    };
+    add(coordinate.name, velocities[j], q[j], of_q);
+    add(velocities[j], coordinate.name, dq[j], of_dq);
+    add(velocities[j], acceleration_names[j], dq[j], of_dq_by_ddq);
+    add(acceleration_names[j], velocities[j], ddq[j], of_ddq);
+  }
+  return texts;
+}
 
 std::vector<std::string> wrong_rates(const System& system, const Ref<const MatrixXd>& states,
                                      const Ref<const MatrixXd>& accelerations, bool reads_time, double* unit) {
@@ -417,6 +571,22 @@ std::optional<std::string> pile_up_text(const std::string& name, const Ref<const
 
 std::optional<std::string> clipped_input(const std::string& input, const Ref<const RowVectorXd>& values) {
   return pile_up_text(fmt::format("the input {}", input), values, "clipped? The log must contain the acting input");
+}
+
+std::optional<std::string> clipped_velocity(const std::string& name, const Ref<const RowVectorXd>& velocities,
+                                            const Ref<const RowVectorXd>& accelerations) {
+  constexpr double small = 0.15;
+  const std::optional<PileUp> found = pile_up(velocities);
+  if (!found) return std::nullopt;
+  double all = 0, clipped = 0, n = 0, n_clipped = 0;
+  for (Index i = 0; i < velocities.size(); ++i) {
+    const double square = accelerations[i] * accelerations[i];
+    if (std::isnan(square)) continue;
+    all += square, ++n;
+    if (velocities[i] == found->value) clipped += square, ++n_clipped;
+  }
+  if (!(clipped * n > small * small * all * n_clipped)) return std::nullopt;
+  return pile_up_text(name, velocities, "a sensor at the end of its range?");
 }
 
 std::vector<Index> far_values(const Ref<const RowVectorXd>& values) {

@@ -21,6 +21,7 @@ struct RateColumns {
   std::size_t own = 0;                              // which of the rates is said to be the column's
   bool may_jump = false;                            // the column, at impacts, of which its rate shows nothing
   const Eigen::RowVectorXd* just_before = nullptr;  // the rate just before each row, where it jumps at rows; null: it does not
+  const std::vector<Eigen::RowVectorXd>* values = nullptr;  // the columns of which the rates should be those; null: not known
 };
 
 /// What else the rate would have to be for the values to follow from it: a factor, a lag, another column. Empty where it is right,
@@ -39,6 +40,12 @@ std::vector<std::string> wrong_rates(const System& system, const Eigen::Ref<cons
                                      const Eigen::Ref<const Eigen::MatrixXd>& accelerations, bool reads_time,
                                      double* unit = nullptr);
 
+/// Of the same log: which single values do not go with their rate, or with that of which they are one, while the rows beside them go
+/// with each other; a sentence for each column. None where many do not.
+/// @param unit_of_time  as wrong_rates tells it [s]
+std::vector<std::string> single_wrong_values(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                             const Eigen::Ref<const Eigen::MatrixXd>& accelerations, double unit_of_time);
+
 /// What a column looks like that was clipped.
 struct PileUp {
   double value = 0;  // the largest or the smallest
@@ -53,6 +60,10 @@ std::optional<std::string> pile_up_text(const std::string& name, const Eigen::Re
                                         const std::string& meaning);
 /// The same of an input.
 std::optional<std::string> clipped_input(const std::string& input, const Eigen::Ref<const Eigen::RowVectorXd>& values);
+
+/// The same of a velocity; nothing where the system moves on at that speed, as a drive does: its acceleration is small there.
+std::optional<std::string> clipped_velocity(const std::string& name, const Eigen::Ref<const Eigen::RowVectorXd>& velocities,
+                                            const Eigen::Ref<const Eigen::RowVectorXd>& accelerations);
 
 /// The few values, at most one in 200 and at least one, that lie thirty times as far from the median as any other; none where all
 /// others are the same, as those of an input between pulses are.

@@ -323,6 +323,131 @@ double total_gain(const DerivedData& data) {
   return gain;
 }
 
+// Smooths a raw log, learns from that, and smooths with what was learned.
+class RawLearner {
+ public:
+  RawLearner(const FitRequest& request, const CsvTable& log, const RawFitOptions& options, const std::atomic<bool>* stop)
+      : request_(request), log_(log), options_(options), smoothing_(options.derive), stop_(stop) {
+    smoothing_.columns = columns_of_raw(request, log);
+    require_inputs(request, log, smoothing_.columns);
+    smoothing_.stop = stop;
+    smoothing_.keep_positions = true;
+  }
+
+  LearnedLog run() {
+    LearnedLog once = with_rows(derive(request_.model, log_, smoothing_));
+    return with_windows(options_.most_passes == 0 ? std::move(once) : smoothed_again(std::move(once)));
+  }
+
+ private:
+  // Those that cover the motion best.
+  [[nodiscard]] std::vector<int> rows_of(const DerivedData& data, int n) const {
+    const CsvTable table = as_table(data, *request_.model.system, log_.name());
+    return resample(request_.model, table, {.n = std::min(n, table.n_rows())}).rows;
+  }
+
+  [[nodiscard]] LearnedLog with_rows(DerivedData data) const {
+    LearnedLog out{std::move(data), {}, {}, {}, {}};
+    if (log_.file()) out.files = {*log_.file()};
+    out.rows = rows_of(out.data, request_.problem.max_points.value_or(n_raw_rows));
+    std::ranges::sort(out.rows);
+    return out;
+  }
+
+  void learn_from(const LearnedLog& before) {
+    with_warnings(before.data.notes, [&] {
+      FitRequest quick = before.request(request_, log_.name());
+      const CsvTable whole = *quick.problem.commands;
+      quick.model.actuators = actuators_;
+      quick.hyperparameters = HyperparameterChoice::optimise;
+      quick.standard_errors = quick.thin = quick.problem.robust = false;
+      const FitJob job = prepare_fit(std::move(quick));
+      const FitOutcome fit = run_fit(job, {}, stop_);
+      if (is_set(stop_)) throw NumericalError("stopped while learning from the raw log");
+      actuators_ = fit.file.model.actuators;
+      last_ = {fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole)};
+    });
+  }
+
+  LearnedLog smoothed_by_fit_to(const LearnedLog& before) {
+    learn_from(before);
+    return with_rows(
+        derive(request_.model, log_, smoothing_, left_out_accelerations(last_->posterior, last_->lines, last_->states)));
+  }
+
+  // As often as that makes held-out positions likelier.
+  LearnedLog smoothed_again(LearnedLog best) {
+    constexpr double decisive = 10;  // nats
+    LearnedLog next = smoothed_by_fit_to(best);
+    const double first = total_gain(next.data);
+    std::vector<double> gains;
+    while (static_cast<int>(gains.size()) < options_.most_passes) {
+      // how good a smoothing is to learn from shows in the one after it
+      LearnedLog after = smoothed_by_fit_to(next);
+      const double gain = total_gain(after.data);
+      if (!(gain > total_gain(next.data) + decisive)) break;
+      gains.push_back(gain);
+      best = std::exchange(next, std::move(after));
+    }
+    best.notes.push_back(gains.empty()
+                             ? "smoothing with the learned dynamics does not make held-out positions likelier: it is not used"
+                             : fmt::format("smoothed {} times with the learned dynamics: log likelihood of held-out positions + "
+                                           "{:.4g}, learned from that + {:.4g}",
+                                           gains.size(), first, fmt::join(gains, ", + ")));
+    best.gains = std::move(gains);
+    return best;
+  }
+
+  // How the accelerations at some rows change with errors of their states.
+  std::vector<StateSensitivity> sensitivities_at(const std::vector<int>& rows, LearnedLog& learned) {
+    if (learned.data.independent.empty()) return {};
+    if (!last_) {
+      const std::size_t step = (learned.rows.size() + n_raw_rows - 1) / n_raw_rows;
+      for (std::size_t i = 0; i * step < learned.rows.size(); ++i) learned.rows[i] = learned.rows[i * step];
+      learned.rows.resize((learned.rows.size() + step - 1) / step);
+      learn_from(learned);
+    }
+    try {
+      return sensitivities_of(last_->posterior, learned.data, last_->states, rows);
+    } catch (const InputError& error) {
+      learned.notes.push_back(
+          fmt::format("warning: errors of the smoothed states are neglected in the noise of windows, since accelerations near "
+                      "these states are unknown: {} Standard errors may be too small; compare a fit with `windows=none`",
+                      error.what()));
+      return {};
+    }
+  }
+
+  LearnedLog with_windows(LearnedLog learned) {
+    if (!options_.windows || !learns_from_windows(request_, learned.data)) return learned;
+    constexpr int n_values = 2 * n_window_states;  // of accelerations, that are no more than can be fitted in a minute or two
+    const auto n_independent = static_cast<int>(std::max<Index>(1, std::ssize(learned.data.independent)));
+    const int n = request_.problem.max_points.value_or(std::min(n_window_states, n_values / n_independent));
+    const WindowChoice choice(learned.data, *request_.model.system, rows_of(learned.data, n), n);
+    // a group of eight windows takes eighteen states: of a few groups less is learned than from as many rows, which lie apart
+    if (n < n_raw_rows && !choice.covers_log()) return learned;
+    const std::vector<StateSensitivity> sensitivities = sensitivities_at(choice.rows(), learned);
+    learned.rows = choice.rows();
+    learned.windows = std::make_shared<const Windows>(choice.windows(sensitivities));
+    for (DerivedSeries& series : learned.data.series) series.positions = std::vector<Measurement>();  // `= {}` keeps the memory
+    return learned;
+  }
+
+  struct Learned {
+    Posterior posterior;
+    std::vector<int> lines;
+    MatrixXd states;  // of all rows, with what acts
+  };
+
+  const FitRequest& request_;
+  const CsvTable& log_;
+  const RawFitOptions& options_;
+  DeriveOptions smoothing_;
+  const std::atomic<bool>* stop_;
+  std::vector<Actuator> actuators_ = request_.model.actuators;  // estimated anew by each fit, from where the last one found them
+  std::optional<Learned> last_;
+};
+
 }  // namespace
 
 std::vector<Option> options(RawFitOptions& options) {
@@ -350,7 +475,7 @@ FitRequest LearnedLog::request(FitRequest asked, const std::string& name) const 
     for (const int j : told.measured) told.is_independent.row(j) = true;
   }
   CsvTable whole = as_table(told, *asked.model.system, name);
-  asked.logs = {{.table = whole.take(rows), .windows = windows}};
+  asked.logs = {{.table = whole.take(rows), .windows = windows, .is_smoothed = true}};
   // the smoothed log has the names of the model, side information those of its files
   asked.problem.columns = columns_in(tables_of(asked.also), *asked.model.system, std::move(asked.problem.columns));
   std::erase_if(asked.problem.columns, [&](const auto& entry) { return whole.find(entry.second) >= 0; });
@@ -372,98 +497,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
                             const std::atomic<bool>* stop) {
   require_in_range(request);
   if (options.most_passes < 0) throw InputError(fmt::format("`passes`: must not be negative, got {}", options.most_passes));
-  const System& system = *request.model.system;
-  DeriveOptions smoothing = options.derive;
-  smoothing.columns = columns_of_raw(request, log);
-  require_inputs(request, log, smoothing.columns);
-  smoothing.stop = stop;
-  const auto with_rows = [&](DerivedData data) {
-    LearnedLog out{std::move(data), {}, {}, {}, {}};
-    if (log.file()) out.files = {*log.file()};
-    const CsvTable table = as_table(out.data, system, log.name());
-    const int n = std::min(request.problem.max_points.value_or(n_raw_rows), table.n_rows());
-    out.rows = resample(request.model, table, {.n = n}).rows;
-    std::sort(out.rows.begin(), out.rows.end());
-    return out;
-  };
-  std::vector<Actuator> actuators = request.model.actuators;  // estimated anew by each fit, from where the last one found them
-  struct Learned {
-    Posterior posterior;
-    std::vector<int> lines;
-    MatrixXd states;  // of all rows, with what acts
-  };
-  std::optional<Learned> last;
-  const auto learn_from_rows = [&](const LearnedLog& before) {
-    FitRequest quick = before.request(request, log.name());
-    const CsvTable whole = *quick.problem.commands;
-    quick.model.actuators = actuators;
-    quick.hyperparameters = HyperparameterChoice::optimise;
-    quick.standard_errors = quick.thin = quick.problem.robust = false;
-    const FitJob job = prepare_fit(std::move(quick));
-    const FitOutcome fit = run_fit(job, {}, stop);
-    if (is_set(stop)) throw NumericalError("stopped while learning from the raw log");
-    actuators = fit.file.model.actuators;
-    last = {fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole)};
-  };
-  const auto learn_from = [&](const LearnedLog& before) { with_warnings(before.data.notes, [&] { learn_from_rows(before); }); };
-  const auto smoothed_by_fit_to = [&](const LearnedLog& before) {
-    learn_from(before);
-    return with_rows(derive(request.model, log, smoothing, left_out_accelerations(last->posterior, last->lines, last->states)));
-  };
-
-  const auto with_windows = [&](LearnedLog learned) {
-    if (!options.windows || !learns_from_windows(request, learned.data)) return learned;
-    const CsvTable table = as_table(learned.data, system, log.name());
-    constexpr int n_values = 2 * n_window_states;  // of accelerations, that are no more than can be fitted in a minute or two
-    const auto n_independent = static_cast<int>(std::max<Index>(1, std::ssize(learned.data.independent)));
-    const int n = request.problem.max_points.value_or(std::min(n_window_states, n_values / n_independent));
-    const WindowChoice choice(learned.data, system, resample(request.model, table, {.n = std::min(n, table.n_rows())}).rows, n);
-    // a group of eight windows takes eighteen states: of a few groups less is learned than from as many rows, which lie apart
-    if (n < n_raw_rows && !choice.covers_log()) return learned;
-    std::vector<StateSensitivity> sensitivities;
-    if (!learned.data.independent.empty()) {
-      if (!last) {
-        const std::size_t step = (learned.rows.size() + n_raw_rows - 1) / n_raw_rows;
-        for (std::size_t i = 0; i * step < learned.rows.size(); ++i) learned.rows[i] = learned.rows[i * step];
-        learned.rows.resize((learned.rows.size() + step - 1) / step);
-        learn_from(learned);
-      }
-      try {
-        sensitivities = sensitivities_of(last->posterior, learned.data, last->states, choice.rows());
-      } catch (const InputError& error) {
-        learned.notes.push_back(
-            fmt::format("warning: errors of the smoothed states are neglected in the noise of windows, since accelerations near "
-                        "these states are unknown: {} Standard errors may be too small; compare a fit with `windows=none`",
-                        error.what()));
-      }
-    }
-    learned.rows = choice.rows();
-    learned.windows = std::make_shared<const Windows>(choice.windows(sensitivities));
-    for (DerivedSeries& series : learned.data.series) series.positions = std::vector<Measurement>();  // `= {}` keeps the memory
-    return learned;
-  };
-  smoothing.keep_positions = true;
-  LearnedLog best = with_rows(derive(request.model, log, smoothing));
-  if (options.most_passes == 0) return with_windows(std::move(best));
-  constexpr double decisive = 10;  // nats
-  LearnedLog next = smoothed_by_fit_to(best);
-  const double first = total_gain(next.data);
-  std::vector<double> gains;
-  while (static_cast<int>(gains.size()) < options.most_passes) {
-    // how good a smoothing is to learn from shows in the one after it
-    LearnedLog after = smoothed_by_fit_to(next);
-    const double gain = total_gain(after.data);
-    if (!(gain > total_gain(next.data) + decisive)) break;
-    gains.push_back(gain);
-    best = std::exchange(next, std::move(after));
-  }
-  best.notes.push_back(gains.empty()
-                           ? "smoothing with the learned dynamics does not make held-out positions likelier: it is not used"
-                           : fmt::format("smoothed {} times with the learned dynamics: log likelihood of held-out positions + "
-                                         "{:.4g}, learned from that + {:.4g}",
-                                         gains.size(), first, fmt::join(gains, ", + ")));
-  best.gains = std::move(gains);
-  return with_windows(std::move(best));
+  return RawLearner(request, log, options, stop).run();
 }
 
 }  // namespace gp2

@@ -105,7 +105,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   note_violation(system, readings.states, logged.parameters, log.table.name(), notes, &options);
   note_repeated_rows({readings.states, readings.values}, log.table.name(), notes);
   if (!logged.other) note_rest(logged.model, logged.parameters, readings.states, readings.values, log.table.name(), notes);
-  const bool has_wrong_rate = !log.windows && note_channels(logged.prior, log.table, columns, logged.actuators, notes);
+  const bool has_wrong_rate = !log.is_smoothed && note_channels(logged.prior, log.table, columns, logged.actuators, notes);
 
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table.name(), notes);

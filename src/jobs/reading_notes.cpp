@@ -241,8 +241,9 @@ void require_mechanics_at(const LoggedSystem& logged, const View& view, const Ma
         std::copy(here.begin(), here.end(), ranks.begin() + first);
       });
   if (fault) {
-    throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log,
-                                 data_row(fault->state), fault->text, logged.system().name()));
+    const bool is_of_model = logged.other || logged.parameters == logged.system().parameter_values();
+    throw InputError(fmt::format("{}: data row {}: {} ('{}' with the {} parameters; see gp2 check)", log, data_row(fault->state),
+                                 fault->text, logged.system().name(), is_of_model ? "model's" : "fit's"));
   }
   const LowerRank lower = states_of_lower_rank(ranks);
   if (lower.states.empty()) return;
@@ -317,14 +318,6 @@ void note_rest(const Model& model, const VectorXd& parameters, const MatrixXd& s
   if (!text.empty()) notes.push_back(fmt::format("warning: {}: {}", log, text));
 }
 
-std::vector<std::string> wrong_rates_of(const System& system, const Prior& prior, const CsvTable& log,
-                                        const std::map<std::string, std::string>& columns, double* unit) {
-  const std::optional<LoggedMotion> motion = read_motion(system, log, columns);
-  if (!motion) return {};
-  const bool reads_time = prior.reads()[static_cast<std::size_t>(system.layout().t())];
-  return wrong_rates(system, motion->states, motion->accelerations, reads_time, unit);
-}
-
 std::optional<std::string> text_of_late_inputs(const System& system, const std::vector<bool>& reads,
                                                const std::vector<Actuator>& actuators, double unit_of_time) {
   std::vector<std::string> names;
@@ -341,18 +334,36 @@ std::optional<std::string> text_of_late_inputs(const System& system, const std::
       unit_of_time, fmt::join(names, ", "));
 }
 
+std::vector<std::string> note_late_inputs(const Prior& prior, const CsvTable& log,
+                                          const std::map<std::string, std::string>& columns,
+                                          const std::vector<Actuator>& actuators, std::vector<std::string>& notes, double* unit) {
+  const System& system = *prior.system;
+  const std::optional<LoggedMotion> motion = read_motion(system, log, columns);
+  if (!motion) return {};
+  const std::vector<bool> reads = prior.reads();
+  double unit_of_time = 1;
+  std::vector<std::string> wrong = wrong_rates(system, motion->states, motion->accelerations,
+                                               reads[static_cast<std::size_t>(system.layout().t())], &unit_of_time);
+  if (const auto text = text_of_late_inputs(system, reads, actuators, unit_of_time))
+    notes.push_back(fmt::format("warning: {}: {}", log.name(), *text));
+  if (unit != nullptr) *unit = unit_of_time;
+  return wrong;
+}
+
 bool note_channels(const Prior& prior, const CsvTable& log, const std::map<std::string, std::string>& columns,
                    const std::vector<Actuator>& actuators, std::vector<std::string>& notes) {
   const auto warn = [&](const std::vector<std::string>& texts) {
     for (const std::string& text : texts) notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
   };
+  const std::size_t n_before = notes.size();
   double unit_of_time = 1;
-  std::vector<std::string> wrong = wrong_rates_of(*prior.system, prior, log, columns, &unit_of_time);
-  if (const auto text = text_of_late_inputs(*prior.system, prior.reads(), actuators, unit_of_time)) wrong.push_back(*text);
-  warn(wrong);
-  if (const auto motion = read_motion(*prior.system, log, columns))
+  warn(note_late_inputs(prior, log, columns, actuators, notes, &unit_of_time));
+  const bool is_wrong = notes.size() > n_before;
+  if (const auto motion = read_motion(*prior.system, log, columns)) {
+    warn(single_wrong_values(*prior.system, motion->states, motion->accelerations, unit_of_time));
     warn(stuck_channels(*prior.system, motion->states, motion->accelerations));
-  return !wrong.empty();
+  }
+  return is_wrong;
 }
 
 std::vector<std::string> shared_load_texts(const Model& model, const System& system, const MechanicsBatch& mechanics) {

@@ -41,10 +41,6 @@ std::string text_of_rest(const Model& model, const Eigen::VectorXd& parameters, 
 void note_rest(const Model& model, const Eigen::VectorXd& parameters, const Eigen::MatrixXd& states,
                const Eigen::MatrixXd& values, const std::string& log, std::vector<std::string>& notes);
 
-/// Columns of a log that are not the rates of what they should be over its time, whether or not a prior reads that: wrong_rates.
-/// @param columns  as checked
-std::vector<std::string> wrong_rates_of(const System& system, const Prior& prior, const CsvTable& log,
-                                        const std::map<std::string, std::string>& columns, double* unit = nullptr);
 /// Columns of a log in order of time that are the same in a stretch of eight rows or more, and hardly ever elsewhere from one row to the
 /// next, a sentence each. A coordinate, a velocity or an acceleration contradicts there what its rate, or that of which it is one, says;
 /// an input is neither 0 nor at an extreme, and the system moves.
@@ -59,6 +55,16 @@ std::vector<std::string> stuck_channels(const System& system, const Eigen::Matri
 /// @param unit_of_time  as wrong_rates tells it [s]
 std::optional<std::string> text_of_late_inputs(const System& system, const std::vector<bool>& reads,
                                                const std::vector<Actuator>& actuators, double unit_of_time);
+
+/// Warns of that.
+/// @param columns    as checked
+/// @param actuators  of the inputs of the log
+/// @param unit       receives the unit of time [s], if given
+/// @returns columns of the log that are not the rates of what they should be over its time, whether or not a prior reads that
+std::vector<std::string> note_late_inputs(const Prior& prior, const CsvTable& log,
+                                          const std::map<std::string, std::string>& columns,
+                                          const std::vector<Actuator>& actuators, std::vector<std::string>& notes,
+                                          double* unit = nullptr);
 
 /// Warns of wrong rates, of delays in another unit than t, and of channels that are stuck for a while.
 /// @param actuators  of the inputs of the log

@@ -218,8 +218,9 @@ void residual_advice(const Report& report, std::vector<Advice>& advice) {
   }
 }
 
-// A noise that came with each value is changed in the log, any other by an option.
+// A noise that came with each value is changed in the log, any other by an option, which a baseline does not have.
 std::string noise_mend(const Report& report, const char* too) {
+  if (report.fit.prior_options.baseline) return fmt::format("the noise is stated too {}", too);
   const bool is_stated =
       std::any_of(report.fit.observations.begin(), report.fit.observations.end(), [](const Observations& group) {
         bool any = false;

@@ -238,11 +238,9 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
   if (request.truth && request.truth->system->state_names() == system.state_names())
     data.truth_inputs = inputs_of_truth(*request.truth, table, reader, data.states);
   double unit_of_time = 1;
-  const std::vector<std::string> wrong =
-      wrong_rates_of(system, at.prior, table, checked_columns(*at.model, {&table}, request.columns), &unit_of_time);
+  const std::vector<std::string> wrong = note_late_inputs(at.prior, table, checked_columns(*at.model, {&table}, request.columns),
+                                                          without_estimates(at.actuators), data.notes, &unit_of_time);
   for (const std::string& text : wrong) data.notes.push_back(fmt::format("warning: {}: {}", table.name(), text));
-  if (const auto text = text_of_late_inputs(system, at.prior.reads(), without_estimates(at.actuators), unit_of_time))
-    data.notes.push_back(fmt::format("warning: {}: {}", table.name(), *text));
   if (unit_of_time != 1) {
     data.states.row(system.layout().t()) *= unit_of_time;
     data.notes.push_back(

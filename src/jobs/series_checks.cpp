@@ -10,8 +10,8 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <Eigen/QR>
 
+#include "base/decompositions.hpp"
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 #include "jobs/rate_check.hpp"
@@ -145,18 +145,17 @@ std::vector<double> numbers_on_even_clock(const std::vector<double>& times, bool
 // that are noise alone it has the deviation of the noise, however the times lie.
 double error_of_middle(const std::vector<double>& times, const std::vector<double>& values, std::size_t middle, double step) {
   constexpr int n_beside = 3, n_terms = 5;
-  Eigen::Matrix<double, 2 * n_beside, n_terms> powers;
-  Eigen::Matrix<double, 2 * n_beside, 1> beside;
-  int row = 0;
+  Eigen::MatrixXd powers(n_terms, 2 * n_beside);
+  Eigen::VectorXd beside(2 * n_beside);
+  int at = 0;
   for (std::size_t k = middle - n_beside; k <= middle + n_beside; ++k) {
     if (k == middle) continue;
     const double x = (times[k] - times[middle]) / (n_beside * step);
-    for (int p = 0; p < n_terms; ++p) powers(row, p) = std::pow(x, p);
-    beside[row++] = values[k] - values[middle];
+    for (int p = 0; p < n_terms; ++p) powers(p, at) = std::pow(x, p);
+    beside[at++] = values[k] - values[middle];
   }
   // the value at 0 is linear in the others
-  const Eigen::Matrix<double, 2 * n_beside, 1> weights =
-      powers.transpose().completeOrthogonalDecomposition().solve(Eigen::Matrix<double, n_terms, 1>::Unit(0));
+  const Eigen::VectorXd weights = least_squares(powers, Eigen::VectorXd::Unit(n_terms, 0));
   return std::abs(weights.dot(beside)) / std::sqrt(1 + weights.squaredNorm());
 }
 

@@ -10,9 +10,8 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <Eigen/Eigenvalues>
-#include <Eigen/QR>
 
+#include "base/decompositions.hpp"
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "data/evenly.hpp"
@@ -79,8 +78,7 @@ Step gauss_newton(const std::vector<LinearisedMotion>& all, const VectorXd& weig
   MatrixXd A = MatrixXd::Zero(p, p), gradients(p, std::ssize(all));
   for (const LinearisedMotion& one : all) {
     const VectorXd w = row_weights(weights, one.residual.size());
-    const auto& qr = by_starts.emplace_back(w.asDiagonal() * one.by_start);
-    step.starts.emplace_back(qr.householderQ() * MatrixXd::Identity(w.size(), qr.rank()));
+    step.starts.push_back(basis_of_range(by_starts.emplace_back(MatrixXd(w.asDiagonal() * one.by_start))));
     MatrixXd J = unexplained(step.starts.back(), w.asDiagonal() * one.by_theta);
     A += J.transpose() * J;
     gradients.col(std::ssize(step.J)) = J.transpose() * w.cwiseProduct(one.residual);
@@ -92,12 +90,12 @@ Step gauss_newton(const std::vector<LinearisedMotion>& all, const VectorXd& weig
   constexpr double determined = 1e-10;
   if (!(unit.minCoeff() > 0) || !(Eigen::SelfAdjointEigenSolver<MatrixXd>(correlation).eigenvalues()[0] > determined))
     throw NumericalError(fmt::format("the motions do not determine separately: {}", fmt::join(names, ", ")));
-  step.inverse = scaled * correlation.inverse() * scaled;
+  step.inverse = scaled * inverse_of(correlation) * scaled;
   // the jackknife; of what one stretch alone says it knows nothing
   VectorXd scatter = VectorXd::Zero(p);
   for (std::size_t k = 0; k < step.J.size(); ++k) {
     const MatrixXd others = A - step.J[k].transpose() * step.J[k];
-    scatter += others.completeOrthogonalDecomposition().solve(gradients.col(static_cast<Index>(k))).cwiseAbs2();
+    scatter += least_squares(others, gradients.col(static_cast<Index>(k))).cwiseAbs2();
   }
   const auto K = static_cast<double>(all.size());
   step.variance = ((K - 1) / K * scatter).cwiseMax(step.inverse.diagonal());
@@ -105,7 +103,7 @@ Step gauss_newton(const std::vector<LinearisedMotion>& all, const VectorXd& weig
   for (std::size_t k = 0; k < all.size(); ++k) {
     const VectorXd left = all[k].residual - all[k].by_theta * step.of_theta;
     const VectorXd w = row_weights(weights, left.size());
-    step.of_starts.emplace_back(all[k].basis * by_starts[k].solve(w.asDiagonal() * left));
+    step.of_starts.emplace_back(all[k].basis * least_squares(by_starts[k], w.asDiagonal() * left));
   }
   return step;
 }

@@ -5,8 +5,7 @@
 #include <numbers>
 #include <utility>
 
-#include <Eigen/QR>
-
+#include "base/decompositions.hpp"
 #include "base/parallel.hpp"
 #include "base/stop.hpp"
 #include "gp2/error.hpp"
@@ -111,7 +110,7 @@ MatrixXd ShootingMotion::tangents(const VectorXd& parameters, const VectorXd& st
   }
   Eigen::ColPivHouseholderQR<MatrixXd> qr(changes);
   qr.setThreshold(0.03);  // beyond what curvature leaves of a change that the constraints forbid
-  return log_.spread.asDiagonal() * MatrixXd(qr.householderQ()).leftCols(qr.rank());
+  return log_.spread.asDiagonal() * basis_of_range(qr);
 }
 
 std::vector<LinearisedMotion> ShootingMotion::linearise(const std::vector<Hyperparameter>& hyperparameters,

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <functional>
 #include <memory>
+#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -192,6 +193,7 @@ InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuat
     }
     return signal;
   } catch (const InputError& error) {
+    if (std::string_view(error.what()).starts_with(table.name() + ": ")) throw;  // a table of arrays is called 'inputs'
     throw InputError(fmt::format("{}: {}", table.name(), error.what()));
   }
 }

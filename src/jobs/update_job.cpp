@@ -130,11 +130,10 @@ std::string reason_of_loss(const Posterior& posterior, const Observations& more)
   return "at states for which the points are too few";
 }
 
-// Noise that is given or stated must be usable, as that of a fit, whose accelerations tell how far they spread. Points that stand for
-// observations need no such limit.
+// Noise that is given or stated must be usable, as that of a fit, whose accelerations tell how far they spread.
 void require_usable_noise(const Posterior& posterior, const Observations& more, const CsvTable& log, const std::vector<int>& rows,
                           bool is_given) {
-  if (posterior.summary() || more.n_data() == 0) return;
+  if (more.n_data() == 0) return;
   const std::vector<std::string> names = more.view().names(*posterior.prior().system);
   const MatrixXd noise = more.noise_of_values(more.noise().stddev());
   for (const Observations& group : posterior.observations()) {
@@ -345,10 +344,8 @@ std::vector<int> read_more(const FitFile& fit, const Posterior& posterior, const
   const std::optional<CommandedRows> commanded =
       take_commands(*prior.system, without_estimates(fit.model.actuators), reader, std::nullopt, {}, readings.states, notes);
   if (commanded) {
-    double unit_of_time = 1;
-    wrong_rates_of(*prior.system, prior, log, checked_columns(fit.model, {&log}, request.columns), &unit_of_time);
-    if (const auto text = text_of_late_inputs(*prior.system, prior.reads(), without_estimates(fit.model.actuators), unit_of_time))
-      notes.push_back(fmt::format("warning: {}: {}", log.name(), *text));
+    note_late_inputs(prior, log, checked_columns(fit.model, {&log}, request.columns), without_estimates(fit.model.actuators),
+                     notes);
   }
   const MatrixXd state_stddevs = projects ? stated_state_deviations(*prior.system, reader) : MatrixXd();
   note_reading(reader, notes);
@@ -460,6 +457,8 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   }
   const Observations all{std::move(readings.states), std::move(readings.view), std::move(readings.values), std::move(noise)};
   Observations more = all.take(rows);
+  require_mechanics_at({fit.model, nullptr, nullptr, posterior.prior(), posterior.values().parameters, {}}, more.view(),
+                       more.states(), rows, log.name(), notes);
   require_usable_noise(posterior, more, log, rows, request.noise_stddev.has_value());
   // rows that the window leaves behind do not count twice
   const std::int64_t n_left = request.window ? *request.window - more.n_data() : posterior.n_states();
@@ -543,8 +542,13 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   add_impossible_note(n_draws - all.n_components(), n_draws, notes);
   if (n_more > 0) fit.notes.reset();
   if (n_more > 0 && fit.report.inducing) fit.report.inducing->stretches.reset();  // they were of the data before
-  if (n_more > 0) fit.logs = std::move(logs);
-  if (n_more > 0 && log.file()) fit.logs.emplace_back(*log.file()).n_learned = n_more;
+  if (n_more > 0) {
+    // rows of arrays, which have no file, count as one log with those just before
+    const bool goes_on = !log.file() && !logs.empty() && logs.back().checksum.empty();
+    if (!goes_on) logs.push_back(log.file().value_or(LogFile{log.name()}));
+    logs.back().n_learned = logs.back().n_learned.value_or(0) + n_more;
+    fit.logs = std::move(logs);
+  }
   const bool is_last = (", " + fit.data_source).ends_with(", " + log.name());
   if (n_more > 0 && !is_last) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
   const double of_more = left_out(all) - before;

@@ -549,6 +549,30 @@ std::vector<MatrixXd> evaluate_part(const System& system, SystemPart part, const
   return {values.mass, values.constraint_matrix, values.constraint_vector};
 }
 
+// Functions of all states at once must give each its own values: not one array for all, nor those of its neighbours.
+void check_states_apart(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                        std::vector<Finding>& findings) {
+  if (has_expressions(system) || states.cols() < 2) return;
+  for (const auto& [part, text] : {std::pair(SystemPart::mechanics, "M, A or b"), std::pair(SystemPart::force, "F"),
+                                   std::pair(SystemPart::residuals, "the residuals")}) {
+    const std::vector<MatrixXd> together = evaluate_part(system, part, states, parameters);
+    for (const Index i : {Index{0}, states.cols() / 2, states.cols() - 1}) {
+      const std::vector<MatrixXd> alone = evaluate_part(system, part, states.col(i), parameters);
+      bool differs = false;
+      for (std::size_t k = 0; k < alone.size(); ++k) {
+        const auto a = alone[k].col(0).array(), b = together[k].col(i).array();
+        const double size = alone[k].size() == 0 ? 0 : a.isFinite().select(a.abs(), 0).maxCoeff();
+        differs = differs || !(a == b || (a - b).abs() <= 1e-9 * size || (a.isNaN() && b.isNaN())).all();
+      }
+      if (!differs) continue;
+      findings.push_back({Level::error, fmt::format("{} of state {} differ when it is asked alone: the function mixes rows, or "
+                                                    "returns the same array each time (copy it)",
+                                                    text, i + 1)});
+      break;
+    }
+  }
+}
+
 // Functions declare what they read; what they read besides has no derivative in the state. Expressions show it themselves.
 void check_reads(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                  std::vector<Finding>& findings) {
@@ -612,6 +636,7 @@ std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd
   if (!check_mechanics(system, states, parameters, n_threads, findings)) return findings;
   check_parameter_derivatives(system, states, parameters, n_threads, findings);
   check_motion(system, states, parameters, n_threads, findings);
+  check_states_apart(system, states, parameters, findings);
   check_reads(system, states, parameters, findings);
   return findings;
 }

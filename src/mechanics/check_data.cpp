@@ -417,27 +417,28 @@ std::string ConstraintResidual::text() const {
     return fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}', expected {:.3g} from the noise", rms, constraint,
                        expected);
   }
+  const char* const word = lines.empty() ? "row" : "line";
   std::vector<int> rows;
-  for (const int state : worst) rows.push_back(state + 1);
+  for (const int state : worst) rows.push_back(lines.empty() ? state + 1 : lines[static_cast<std::size_t>(state)]);
   if (n_outliers > 0) {
     rows.resize(std::min(rows.size(), static_cast<std::size_t>(n_outliers)));
     return fmt::format(
         "measured ddq on A ddq = b: rms residual {:.3g} for '{}' is more than noise, but only because of {} of {} rows (farthest "
-        "off: row {}): outliers of the log, or an event that the model lacks, such as a collision; correct or leave out these "
+        "off: {} {}): outliers of the log, or an event that the model lacks, such as a collision; correct or leave out these "
         "rows, or give them less weight by a fit with `robust`",
-        rms, constraint, n_outliers, n, fmt::join(rows, ", "));
+        rms, constraint, n_outliers, n, word, fmt::join(rows, ", "));
   }
   if (!is_known) {
     return fmt::format(
         "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, is more than noise: a constraint, a "
-        "unit, a sign or gravity in a sensor is wrong (farthest off: row {})",
-        rms, constraint, mean, fmt::join(rows, ", "));
+        "unit, a sign or gravity in a sensor is wrong (farthest off: {} {})",
+        rms, constraint, mean, word, fmt::join(rows, ", "));
   }
   return fmt::format(
       "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, expected {:.2g} from the noise: {:.2g} ×; "
       "a constraint, a unit, a sign or gravity in a sensor is wrong, or the noise is stated too small (farthest off: "
-      "row {})",
-      rms, constraint, mean, expected, rms / expected, fmt::join(rows, ", "));
+      "{} {})",
+      rms, constraint, mean, expected, rms / expected, word, fmt::join(rows, ", "));
 }
 
 std::vector<ConstraintResidual> constraint_residuals(const System& system, const Ref<const MatrixXd>& states,

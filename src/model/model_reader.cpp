@@ -19,8 +19,18 @@ void ModelReader::declare(const std::string& name, const TomlValue& at) {
   if (!is_identifier(name)) {
     at.fail(fmt::format("'{}' is not a name: use letters, digits and _, beginning with a letter", name));
   }
-  if (reserved.contains(name)) at.fail(fmt::format("'{}' is the name of a function or constant; choose another", name));
-  if (!names_.insert(name).second) at.fail(fmt::format("the name '{}' is taken already; choose another", name));
+  if (reserved.contains(name)) {
+    at.fail(fmt::format("'{}' is the name of a function or constant; choose another{}", name, way_to_rename()));
+  }
+  if (!names_.insert(name).second) {
+    at.fail(fmt::format("the name '{}' is taken already; choose another{}", name, way_to_rename()));
+  }
+}
+
+const char* ModelReader::way_to_rename() const {
+  return model.robot && !file.has("coordinates")
+             ? R"(, for a joint by coordinates = ["q1", …], one per joint in the order of the file)"
+             : "";
 }
 
 void ModelReader::define_symbols() {
@@ -190,7 +200,6 @@ void read_model(const toml::table& root, const RobotSource& robot, Model& model)
   read_robot(reader, robot);
   read_coordinates(reader);
   read("inputs", read_inputs);
-  refuse_names_of_other_columns(reader);
   read("parameters", read_parameters);
   reader.define_symbols();
   read("parameters", read_derived_parameters);
@@ -204,6 +213,7 @@ void read_model(const toml::table& root, const RobotSource& robot, Model& model)
     model.system = std::make_shared<const SymbolicSystem>(reader.definition);
     if (!model.robot) check_mass_symmetry(reader);
   }
+  refuse_names_of_other_columns(reader);
   read_latents(reader);
   read("noise", read_noise);
   read("truth", read_truth);

@@ -1,3 +1,6 @@
+#include <algorithm>
+#include <iterator>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
@@ -129,20 +132,24 @@ void read_inputs(ModelReader& reader, const TomlValue& inputs) {
 }
 
 void refuse_names_of_other_columns(const ModelReader& reader) {
-  const auto refuse = [&](const std::string& column, const std::string& of) {
-    if (!reader.is_declared(column)) return;
-    reader.file.fail_at(1, reader.file.has("coordinates") ? "coordinates" : "inputs",
+  const System& system = *reader.model.system;
+  std::vector<std::string> names = system.state_names();
+  std::ranges::move(system.acceleration_names(), std::back_inserter(names));
+  const auto forbid = [&](const std::string& column, const std::string& of) {
+    if (std::ranges::count(names, column) == 0) return;
+    reader.file.fail_at(1, reader.file.has("coordinates") ? "coordinates" : "robot",
                         fmt::format("the column {} would be a name of this model and what logs and predictions call a quantity "
-                                    "of '{}'; choose another name",
-                                    column, of));
+                                    "of {}; choose another name{}",
+                                    column, of, reader.way_to_rename()));
   };
-  for (const Coordinate& coordinate : reader.definition.coordinates) {
-    for (const std::string& name : {coordinate.name, coordinate.velocity(), coordinate.acceleration()}) {
-      refuse(name + "_std", coordinate.name);
-    }
-    refuse(coordinate.velocity() + "_next", coordinate.name);
-    for (const char* prefix : {"abar_", "fc_", "force_"}) refuse(prefix + coordinate.name, coordinate.name);
+  for (const Coordinate& coordinate : system.coordinates()) {
+    const std::string of = fmt::format("'{}'", coordinate.name);
+    for (const std::string& name : {coordinate.name, coordinate.velocity(), coordinate.acceleration()}) forbid(name + "_std", of);
+    forbid(coordinate.velocity() + "_next", of);
+    for (const char* prefix : {"abar_", "fc_", "force_"}) forbid(prefix + coordinate.name, of);
   }
+  for (const char* column : {"episode", "energy", "energy_std", "distance_from_data"}) forbid(column, "the motion");
+  for (int row = 1; row <= system.nc(); ++row) forbid(fmt::format("lambda{}", row), "the constraints");
 }
 
 }  // namespace gp2

@@ -18,6 +18,12 @@ void read_columns(ModelReader& reader, const TomlValue& columns) {
   for (const auto& [name, entry] : columns.entries()) {
     if (!known.contains(name)) entry.fail("not a coordinate, velocity, acceleration, input or t of this model");
     const std::string column = entry.text();
+    if (column != name && known.contains(column)) {
+      entry.fail(
+          fmt::format("the column '{0}' has the name of another quantity of this model, and in files that gp2 writes it is that "
+                      "quantity: leave this out, and read logs that are like this with `map={0}={1}`",
+                      column, name));
+    }
     if (!taken.insert(column).second) entry.fail(fmt::format("the column '{}' is another name's already", column));
     reader.model.columns[name] = column;
   }

@@ -32,7 +32,8 @@ class ModelReader {
   // names
   /// Complains of what is no name, or one that something has already.
   void declare(const std::string& name, const TomlValue& at);
-  [[nodiscard]] bool is_declared(const std::string& name) const { return names_.contains(name); }
+  /// What goes behind "choose another" where names are those of the robot's file; else nothing.
+  [[nodiscard]] const char* way_to_rename() const;
   /// From now on coordinates, velocities, accelerations, t, inputs and parameters may stand in expressions.
   void define_symbols();
   /// A name that stands for an expression from now on.
@@ -95,7 +96,8 @@ void read_columns(ModelReader& reader, const TomlValue& columns);
 void read_units(ModelReader& reader, const TomlValue& units);
 void read_drawing(ModelReader& reader, const TomlValue& drawing);
 
-/// A log or a prediction of the coordinate x has columns x_std, ddx_std, abar_x, … beside those of x itself.
+/// A log or a prediction of the coordinate x has columns x_std, ddx_std, abar_x, … beside those of x itself, and a simulated motion
+/// has columns energy, lambda1, … beside those of the state.
 void refuse_names_of_other_columns(const ModelReader& reader);
 /// Parameters that follow from others stand for their expressions wherever they are used.
 void read_derived_parameters(ModelReader& reader, const TomlValue& parameters);

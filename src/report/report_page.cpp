@@ -12,8 +12,8 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
-#include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
+#include "jobs/hyperparameters_json.hpp"
 #include "report/assets.hpp"
 #include "report/markup.hpp"
 
@@ -176,20 +176,11 @@ Json parameters_json(const FitFile& fit) {
   return rows;
 }
 
-Json hyperparameters_json(const FitReport& report, const Model& model) {
-  Json rows = Json::array();
-  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
-    const Hyperparameter& h = report.hyperparameters[k];
-    const std::string unit = unit_of(h, model);
-    rows.push_back({{"name", h.name},
-                    {"value", h.value},
-                    {"lower", h.lower},
-                    {"upper", h.upper},
-                    {"unit", unit.empty() ? h.unit : unit},
-                    {"at_bound", h.at_bound()}});
-    const auto own = static_cast<Eigen::Index>(k);
-    if (report.draws) rows.back()["drawn95"] = {report.draws->lower[own], report.draws->upper[own]};
-  }
+// Beside where most of their draws are.
+Json drawn_hyperparameters_json(const FitReport& report, const Model& model) {
+  Json rows = hyperparameters_json(report, model);
+  for (Index k = 0; report.draws && k < std::ssize(rows); ++k)
+    rows[static_cast<std::size_t>(k)]["drawn95"] = {report.draws->lower[k], report.draws->upper[k]};
   return rows;
 }
 
@@ -401,7 +392,7 @@ Json page_json(const Report& report, const Spelling& spelled) {
                {"prior", prior_json(report.fit)},
                {"observations", observations_json(report.fit)},
                {"parameters", parameters_json(report.fit)},
-               {"hyperparameters", hyperparameters_json(report.fit.report, report.fit.model)},
+               {"hyperparameters", drawn_hyperparameters_json(report.fit.report, report.fit.model)},
                // what a fit said goes as soon as its rows change
                {"fit", fit_json(report.fit.report, report.fit.notes.has_value())},
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},

@@ -90,7 +90,7 @@ std::string mend_of(const std::string& refusal) {
     const char* mend;
   };
   static constexpr const char* missing =
-      "The file of a mesh, height field or texture is missing: put it there or remove the geom";
+      "The file of a mesh, height field or texture is missing: put it there, give its body an <inertial>, or remove the geom";
   static constexpr const char* newer =
       "Where it is no slip of the pen, the file is for another version of MuJoCo: build gp2 with that one (GP2_MUJOCO_DIR)";
   for (const Mend& known :

@@ -265,15 +265,16 @@ void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::ve
   const std::vector<bool> was_closed = is_closed_;
   double loss = impact(state, hit, restitution);
   mark(state);
+  const auto is_back_at_once = [&](std::size_t contact) {
+    const double back = opening(state, contact, acceleration);
+    return back < 0 && 2 * rates(state)[static_cast<Index>(contact)] <= -back * shortest_flight_;
+  };
   // a rebound that is over at once is none
   std::vector<bool> stays = hit;
-  const VectorXd rate = rates(state);
-  for (Index k = 0; k < n; ++k) {
-    const auto contact = static_cast<std::size_t>(k);
-    if (!hit[contact]) continue;
-    const double back = opening(state, contact, acceleration);
-    stays[contact] = restitution[k] == 0 || (back < 0 && 2 * rate[k] <= -back * shortest_flight_);
-    if (stays[contact]) restitution[k] = 0;
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    double& e = restitution[static_cast<Index>(k)];
+    stays[k] = hit[k] && (e == 0 || is_back_at_once(k));
+    if (stays[k]) e = 0;
   }
   if (std::find(stays.begin(), stays.end(), true) != stays.end()) {
     state = before;
@@ -282,6 +283,11 @@ void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::ve
     for (std::size_t k = 0; k < contacts_.size(); ++k) is_closed_[k] = is_closed_[k] || stays[k];
     mark(state);
   }
+  // nor is a foot lifted by a box that rocks onto the other, ever faster, once it is down again at once
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    if (was_closed[k] && !is_closed_[k]) is_closed_[k] = is_back_at_once(k);
+  }
+  mark(state);
   for (std::size_t k = 0; k < contacts_.size(); ++k) {
     if (was_closed[k] && !is_closed_[k]) events.push_back({state[layout_.t()], contacts_[k].row, Kind::released, 0, 0});
     if (!hit[k]) continue;

@@ -164,6 +164,10 @@ DrivenMotion generate_motion(const Model& model, int n, RandomStream& random) {
   step.times.resize(2);
   step.switching = switching_functions(model, /*of_latents=*/false);
   step.initial_step = 1 / model.motion->rate;
+  step.max_steps = 20'000;  // from one sample to the next
+  step.max_steps_advice =
+      "[truth] is stiff there, or the controller needs very large forces (a target that cannot be reached from this posture): "
+      "choose other targets of [motion], longer segments, or a smoother [truth]";
   DrivenMotion motion{MatrixXd(layout.size(), n), MatrixXd(layout.nq, n)};
   for (int i = 0; i < n; ++i) {
     state[layout.t()] = i / model.motion->rate;

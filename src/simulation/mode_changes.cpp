@@ -21,18 +21,20 @@ void ModeChanges::settle(PhasePoint& now, bool has_left) {
   const bool switches = !switching.is_empty() && (has_left || switching.is_guided());
   const std::vector<bool> was_held = held_surfaces();
   if (!switching.is_empty()) {
-    VectorXd state = rhs_.state(now.x, now.t);
     if (switches) {
-      switching.cross(state);
-      switching.put(state);
-      std::copy_n(state.begin(), now.x.size(), now.x.begin());
+      switching.cross(rhs_.state(now.x, now.t));
+      put_on_surfaces(now);
     }
-    switching.turn(state);
+    switching.turn(rhs_.state(now.x, now.t));
   }
   const std::size_t n_events = events_.size();
   if (has_left && !mode_.contacts.is_empty()) settle_contacts(now, /*at_start=*/false);
   const bool has_met = events_.size() > n_events;
+  const bool has_stuck = has_met && !switching.is_empty();
+  if (has_stuck) switching.take_sides(rhs_.state(now.x, now.t));
   const bool has_moved = project(now);
+  // a contact that stays closed without a rebound stops the motion, but lets nothing slip
+  if (has_stuck) put_on_surfaces(now);
   if (switches) {
     settle_switching(now, /*anew=*/has_met || (has_moved && mode_.conditions.has_turned()));
     note_sticks(was_held, now.t);
@@ -74,6 +76,12 @@ void ModeChanges::settle_switching(const PhasePoint& now, bool anew) {
   } catch (const Error& error) {
     rhs_.fail(now.t, error.what());
   }
+}
+
+void ModeChanges::put_on_surfaces(PhasePoint& now) const {
+  VectorXd state = rhs_.state(now.x, now.t);
+  mode_.switching.put(state);
+  std::copy_n(state.begin(), now.x.size(), now.x.begin());
 }
 
 // whether the projection changed the state

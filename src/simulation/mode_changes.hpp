@@ -25,6 +25,7 @@ class ModeChanges {
  private:
   void settle_contacts(PhasePoint& now, bool at_start);
   void settle_switching(const PhasePoint& now, bool anew);
+  void put_on_surfaces(PhasePoint& now) const;
   bool project(PhasePoint& now);
   void note_sticks(const std::vector<bool>& before, double t);
   [[nodiscard]] std::vector<bool> held_surfaces() const;

@@ -19,10 +19,20 @@ namespace {
 // Where the constraints hardly let the motion leave a surface, as a slider at its dead centre, its sides hardly act on the motion.
 constexpr double least_way_out = 1e-4;
 
-// The least x for A x = b. Surfaces that are one, as those of two feet of a box that stands flat, are so up to rounding alone, and no
-// difference between them is to be divided by.
-VectorXd least_solution(MatrixXd A, VectorXd b) {
-  constexpr double alike = 1e-6;  // rows of length 1
+// How far rows of length 1 may differ that are taken for one: those of surfaces that are one, as of two feet of a box that stands flat,
+// are so up to rounding alone.
+constexpr double alike = 1e-6;
+
+// 1 or −1 where two rows of length 1 are alike, up to their sign; else 0.
+template <typename Row, typename Other>
+double common_side(const Row& row, const Other& other) {
+  const double side = row.dot(other) < 0 ? -1 : 1;
+  return (row - side * other).norm() <= alike ? side : 0;
+}
+
+// The least x for A x = b. No difference between rows of length 1 is divided by up to `rounding`.
+VectorXd least_solution(MatrixXd A, VectorXd b, double rounding = alike) {
+  if (A.rows() == 0) return VectorXd::Zero(A.cols());
   for (Index k = 0; k < A.rows(); ++k) {
     const double length = A.row(k).norm();
     if (!(length > 0)) continue;
@@ -30,7 +40,7 @@ VectorXd least_solution(MatrixXd A, VectorXd b) {
     b[k] /= length;
   }
   Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
-  decomposition.setThreshold(alike);
+  decomposition.setThreshold(rounding);
   return decomposition.compute(A).solve(b);
 }
 
@@ -62,6 +72,14 @@ std::vector<int> Switching::sliding() const {
   return surfaces;
 }
 
+std::vector<int> Switching::united_with(int first) const {
+  std::vector<int> surfaces;
+  for (int k = first; k < functions_.size(); ++k) {
+    if (first_united_[static_cast<std::size_t>(k)] == first) surfaces.push_back(k);
+  }
+  return surfaces;
+}
+
 Switching::Surfaces Switching::surfaces_at(const VectorXd& state) const {
   // A line is crossed wherever the motion meets it. How near it comes to a point is left to the tolerances.
   constexpr double to_line = 1e-3, to_point = 10, of_rounding = 1e-12;
@@ -77,24 +95,43 @@ Switching::Surfaces Switching::surfaces_at(const VectorXd& state) const {
     const double of_tolerance = part(size, k).size() == 1 ? to_line : to_point;
     out.margin[k] = of_tolerance * part(size, k).maxCoeff() + of_rounding * part(rounding, k).maxCoeff();
   }
+  // surfaces that are alike are one, which is as thick as they are apart
+  for (Index k = 0; k < out.normals.rows() && toward_.size() == functions_.size(); ++k) {
+    for (Index other = 0; other < k; ++other) {
+      const double length = out.normals.row(k).norm(), other_length = out.normals.row(other).norm();
+      const auto row = out.normals.row(k) / length, other_row = out.normals.row(other) / other_length;
+      const double side = common_side(row, other_row);
+      if (side == 0) continue;
+      const double apart = std::abs((row - side * other_row).dot(dq));
+      out.margin[k] += length * apart;
+      out.margin[other] += other_length * apart;
+    }
+  }
   return out;
 }
 
 // The state with velocities changed, the least that is needed, so that it is toward the given side of every surface; of those that
-// hold it, there exactly, or on the surface where `toward` is 0.
+// hold it, there exactly, or on the surface where `toward` is 0. What holds it comes first: a surface beside it that is hardly apart
+// from those, as of the other foot of a box that rocks, is left where it is, as only far velocities would lead back over it.
 VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const VectorXd& toward) const {
+  constexpr double hardly_apart = 0.1;
   std::vector<int> rows;
   std::vector<double> changes;
-  for (int k = 0; k < functions_.size(); ++k) {
-    const auto d = part(toward, k);
-    const auto g = part(surfaces.g, k);
-    const double along = d.dot(g), margin = surfaces.margin[k];
-    if (hold(k) == Hold::none && !(along < margin)) continue;
-    const VectorXd change = hold(k) == Hold::none   ? VectorXd((margin - along) * d)
-                            : hold(k) == Hold::rest ? VectorXd(margin * d - g)
-                                                    : VectorXd(std::max(margin, along) * d - g);
-    changes.insert(changes.end(), change.begin(), change.end());
-    for (Index j = 0; j < d.size(); ++j) rows.push_back(first_of(k) + static_cast<int>(j));
+  Index n_holding = 0;  // rows
+  for (const bool is_holding : {true, false}) {
+    for (int k = 0; k < functions_.size(); ++k) {
+      if ((hold(k) != Hold::none) != is_holding) continue;
+      const auto d = part(toward, k);
+      const auto g = part(surfaces.g, k);
+      const double along = d.dot(g), margin = surfaces.margin[k];
+      if (!is_holding && !(along < margin)) continue;
+      const VectorXd change = !is_holding             ? VectorXd((margin - along) * d)
+                              : hold(k) == Hold::rest ? VectorXd(margin * d - g)
+                                                      : VectorXd(std::max(margin, along) * d - g);
+      changes.insert(changes.end(), change.begin(), change.end());
+      for (Index j = 0; j < d.size(); ++j) rows.push_back(first_of(k) + static_cast<int>(j));
+    }
+    if (is_holding) n_holding = std::ssize(rows);
   }
   if (rows.empty()) return state;
   const MatrixXd normals = surfaces.normals(rows, Eigen::all);
@@ -104,19 +141,35 @@ VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const Vecto
   for (Index k = 0; k < along.rows(); ++k) {
     if (along.row(k).norm() <= least_way_out * normals.row(k).norm()) along.row(k).setZero();
   }
-  state.segment(layout_.dq(0), layout_.nq) +=
-      T * least_solution(std::move(along), Eigen::Map<const VectorXd>(changes.data(), std::ssize(changes)));
+  const Eigen::Map<const VectorXd> wanted(changes.data(), std::ssize(changes));
+  // surfaces that were one part where their rows differ by `alike`, and hold the motion until settle() lets one of them go
+  const MatrixXd holding = along.topRows(n_holding);
+  const auto solve_holding = [&](const VectorXd& b) { return least_solution(holding, b, 10 * alike); };
+  VectorXd x = solve_holding(wanted.head(n_holding));
+  MatrixXd others = along.bottomRows(along.rows() - n_holding);
+  const VectorXd left = wanted.tail(others.rows()) - others * x;
+  for (Index k = 0; k < others.rows(); ++k) {
+    const VectorXd row = others.row(k).transpose(), free = row - solve_holding(holding * row);
+    others.row(k) = free.transpose();
+    if (free.norm() <= hardly_apart * row.norm()) others.row(k).setZero();
+  }
+  x += least_solution(others, left);
+  state.segment(layout_.dq(0), layout_.nq) += T * x;
   if (constraints_) constraints_(state);
   return state;
 }
 
-void Switching::start(const VectorXd& state, const Acceleration& acceleration) {
+void Switching::take_sides(const VectorXd& state) {
   const Surfaces surfaces = surfaces_at(state);
   for (int k = 0; k < functions_.size(); ++k) {
     const double length = part(surfaces.g, k).norm();
     hold(k) = length > surfaces.margin[k] ? Hold::none : Hold::rest;
     if (hold(k) == Hold::none) part(toward_, k) = part(surfaces.g, k) / length;
   }
+}
+
+void Switching::start(const VectorXd& state, const Acceleration& acceleration) {
+  take_sides(state);
   settle(state, acceleration);
 }
 
@@ -196,8 +249,7 @@ void Switching::settle(const VectorXd& state, const Acceleration& acceleration) 
     for (const int k : sliding()) {
       const double sigma = sigma_[next++];
       if (std::abs(sigma) <= 1) continue;
-      for (int one = k; one < functions_.size(); ++one) {
-        if (first_united_[static_cast<std::size_t>(one)] != k) continue;
+      for (const int one : united_with(k)) {
         hold(one) = part(toward_, one).size() == 1 ? Hold::none : Hold::direction;
         if (sigma < 0) part(toward_, one) *= -1;
       }
@@ -210,9 +262,7 @@ Switching::Values Switching::evaluate(const VectorXd& state, const Surfaces& sur
   VectorXd toward = toward_;
   const std::vector<int> slid_on = sliding();
   const auto flip = [&](std::size_t k) {
-    for (int one = slid_on[k]; one < functions_.size(); ++one) {
-      if (first_united_[static_cast<std::size_t>(one)] == slid_on[k]) part(toward, one) *= -1;
-    }
+    for (const int one : united_with(slid_on[k])) part(toward, one) *= -1;
   };
   const auto value = [&] { return function(beside(state, surfaces, toward)); };
   const std::size_t n = slid_on.size();
@@ -285,7 +335,6 @@ MatrixXd Switching::slopes(const Values& values, const VectorXd& share) {
 
 // Rows of normals and of drift are compared along the velocities that the constraints allow.
 void Switching::unite(const VectorXd& state, const Surfaces& surfaces) {
-  constexpr double alike = 1e-6;  // rows of length 1
   std::iota(first_united_.begin(), first_united_.end(), 0);
   const std::vector<int> slid_on = sliding();
   // points of a plane turn, each in its own direction
@@ -300,8 +349,8 @@ void Switching::unite(const VectorXd& state, const Surfaces& surfaces) {
     row /= length * toward_[slid_on[k]];
     for (std::size_t other = 0; other < k; ++other) {
       const int first = slid_on[other];
-      const double side = row.dot(rows.row(first)) < 0 ? -1 : 1;
-      if (first_united_[static_cast<std::size_t>(first)] != first || !((row - side * rows.row(first)).norm() <= alike)) continue;
+      const double side = common_side(row, rows.row(first));
+      if (first_united_[static_cast<std::size_t>(first)] != first || side == 0) continue;
       first_united_[static_cast<std::size_t>(slid_on[k])] = first;
       toward_[slid_on[k]] *= side;
       break;

@@ -40,7 +40,9 @@ class Switching {
   /// Whether the motion slides on a surface, or creeps from one.
   [[nodiscard]] bool is_guided() const;
 
-  /// Takes the sides that a state is on; on a surface it slides or leaves.
+  /// Takes the sides that a state is on, and the surfaces that it is on.
+  void take_sides(const Eigen::VectorXd& state);
+  /// The same; on a surface it slides or leaves.
   void start(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Whether a state is past a surface, which is then no more on the side taken.
   [[nodiscard]] bool has_crossed(const Eigen::VectorXd& state) const;
@@ -103,6 +105,8 @@ class Switching {
   std::vector<Eigen::MatrixXd> ways_out(const Eigen::VectorXd& state, const Surfaces& surfaces);
   /// The surfaces slid on, of united ones the first.
   [[nodiscard]] std::vector<int> sliding() const;
+  /// The surfaces that are one with a first one, it among them.
+  [[nodiscard]] std::vector<int> united_with(int first) const;
   [[nodiscard]] Hold hold(int surface) const { return hold_[static_cast<std::size_t>(surface)]; }
   Hold& hold(int surface) { return hold_[static_cast<std::size_t>(surface)]; }
   [[nodiscard]] int first_of(int surface) const { return functions_.first()[static_cast<std::size_t>(surface)]; }

@@ -342,10 +342,11 @@ Expression derivative(Expression e, Expression da, Expression db) {
       return or_zero(number(0.5) + number(0.5) * order, da) + or_zero(number(0.5) - number(0.5) * order, db);
     }
     case Operation::multiply_or_zero: {
-      if (!is_over_length(b)) return or_zero(da, b) + or_zero(a, db);
-      // a component over a length has the slope 0 where this is 0, as sign has at 0
-      const Expression sign = function(Operation::sign, b.right());
-      return or_zero(da, or_zero(sign * sign, b)) + or_zero(a, db);
+      const Expression slope = or_zero(da, b) + or_zero(a, db);
+      if (!is_over_length(b)) return slope;
+      // a component over a length has the slope 0 where this is 0, as sign has at 0; single precision can hold the bound too
+      const Expression length = function(Operation::abs, b.right());
+      return or_zero(function(Operation::sign, graph.apply(Operation::max, length - number(1e-30), number(0))), slope);
     }
   }
   return number(0);

@@ -124,6 +124,9 @@ inline void integer_power(int n, std::ptrdiff_t lanes, const double* a, double* 
   }
 }
 
+/// multiply_or_zero takes what is smaller for 0: a velocity that dies away never is, and √(v² + w²) is 0 before v is.
+inline constexpr double negligible = 1e-100;
+
 /// Calls `use` with the arithmetic of `operation` as a function (double a, double b) -> double;
 /// unary ones ignore b. NaN stays NaN.
 template <class Use>
@@ -181,7 +184,7 @@ void with_arithmetic(Operation operation, Use&& use) {
     case Operation::multiply_or_zero:
       return use([](double a, double b) {
         const double product = a * b;
-        return a == 0 ? 0.0 : product;
+        return std::abs(a) < negligible ? 0.0 : product;
       });
   }
 }

@@ -226,10 +226,12 @@ int estimable_parameter(const Prior& prior, const std::string& name) {
   for (const Latent& latent : prior.latents) {
     const std::vector<int>& used = latent.feature_parameters;
     if (std::find(used.begin(), used.end(), index) == used.end()) continue;
-    throw InputError(
-        fmt::format("`estimate`: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
-                    "parameters; write the feature without it, or leave it out",
-                    name, latent.name));
+    throw InputError(fmt::format(
+        "{}: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
+        "parameters; write the feature without it, or leave it out",
+        system.parameters()[static_cast<std::size_t>(index)].estimate ? fmt::format("[parameters] {}: estimate = true", name)
+                                                                      : "`estimate`",
+        name, latent.name));
   }
   return index;
 }
@@ -269,6 +271,10 @@ Hyperparameter parameter_hyperparameter(const Prior& prior, const std::string& n
 }
 
 }  // namespace
+
+void require_estimable(const Prior& prior, const std::string& name) {
+  bounds_of(prior.system->parameters()[static_cast<std::size_t>(estimable_parameter(prior, name))], Protocol{});
+}
 
 std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
                                                     const std::vector<std::string>& estimated, const Protocol& protocol) {

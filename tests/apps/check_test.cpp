@@ -101,6 +101,25 @@ TEST(Check, JudgesPriorsByTheirBounds) {
   EXPECT_THAT(check_of("[0, 2]", "{ mean = 2.1, stddev = 0.1 }").out, Not(HasSubstr("prior")));
 }
 
+TEST(Check, RefusesMarksThatAFitRefuses) {
+  const Desk desk;
+  const auto check_of = [&](const std::string& parameters, const std::string& feature) {
+    desk.write("model.toml",
+               "coordinates = [\"x\"]\n[parameters]\n" + parameters +
+                   "\n[let]\nspeed = \"c*dx\"\n[mechanics]\nmass = [[1]]\nforce = [\"c\"]\n[[latent]]\nfeatures = [\"" + feature +
+                   "\"]\n");
+    return desk.run("gp2 check model.toml");
+  };
+  const Outcome of_feature = check_of("c = { value = 1, estimate = true }", "speed");
+  EXPECT_NE(of_feature.status, 0);
+  EXPECT_THAT(of_feature.out,
+              testing::ContainsRegex("ERROR +.parameters. c: estimate = true: parameter 'c' stands in a feature of the latent"));
+  EXPECT_THAT(check_of("c = { value = 0, estimate = true }", "dx").out,
+              testing::ContainsRegex("ERROR +parameter 'c' is 0 and has no bounds: write c = "));
+  EXPECT_EQ(check_of("c = { value = 1, estimate = true }", "dx").status, 0);
+  EXPECT_EQ(check_of("c = 1", "speed").status, 0);
+}
+
 // an angle that swings by half a radian, in rad and in degrees; a wheel that turns one way as fast as it likes
 TEST(Check, WarnsOfAnAngleThatSwingsByHalfTurnsFromRowToRow) {
   const Desk desk;
@@ -127,6 +146,25 @@ TEST(Check, WarnsOfAnAngleThatSwingsByHalfTurnsFromRowToRow) {
   desk.done("tail -n +2 log.csv | cut -d, -f1,3,4 >> rates.csv");
   EXPECT_THAT(desk.run("gp2 check model.toml --data rates.csv").out,
               testing::ContainsRegex("back and forth, at [0-9]+ of 99 rows: is it in rad"));
+}
+
+// A motor that moves a carriage by a gear turns as far as the carriage moves.
+TEST(Check, BelievesHalfTurnsFromRowToRowThatAConstraintCounts) {
+  const Desk desk;
+  desk.write("model.toml",
+             "coordinates = [{ name = \"a\", angle = true }, \"x\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\n[constraints]\n"
+             "position = [\"x - 0.02*a\"]\n[[latent]]\nfeatures = [\"dx\"]\n");
+  const auto check_of = [&](double ratio) {
+    std::string log = "t,a,da,dda,x,dx,ddx\n";
+    for (int k = 0; k < 100; ++k) {
+      const double t = 0.05 * k, a = 30 * std::sin(4 * t), da = 120 * std::cos(4 * t), dda = -16 * a;
+      log += fmt::format("{},{},{},{},{},{},{}\n", t, a, da, dda, ratio * a, ratio * da, ratio * dda);
+    }
+    desk.write("log.csv", log);
+    return desk.run("gp2 check model.toml --data log.csv").out;
+  };
+  EXPECT_THAT(check_of(0.02), Not(HasSubstr("half a turn")));
+  EXPECT_THAT(check_of(0.02 / 57.3), HasSubstr("half a turn")) << "degrees";
 }
 
 TEST(Check, SaysWhichAccelerationsTheLogLacks) {

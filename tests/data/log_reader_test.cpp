@@ -169,6 +169,9 @@ TEST_F(LogReaderTest, ABadCellIsRefusedOnlyInColumnsThatAreRead) {
   EXPECT_EQ(state("q1,q2\n1,x\n", "q1"), 1);
   EXPECT_EQ(input_error_of([&] { state("q1,q2\n1,x\n", "q2"); }), "log.csv:2: column 'q2': 'x' is not a finite number");
   EXPECT_EQ(input_error_of([&] { value("ddq1\nnan\n", "ddq1"); }), "log.csv:2: column 'ddq1': 'nan' is not a finite number");
+  EXPECT_EQ(
+      input_error_of([&] { state("q1,q2\n1,2\nq1,q2\n3,4\n", "q1"); }),
+      "log.csv:3: column 'q1': 'q1' is not a finite number: the header again: are these files that were joined? Remove the line");
 }
 
 TEST_F(LogReaderTest, KnowsWhatIsThereWithoutReadingIt) {

@@ -89,7 +89,7 @@ TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
   EXPECT_EQ(input_error_of([] {
               problem_of(gappy_log_of({{"ddq2", 4, "nan"}}));
             }),
-            "log.csv: row 5, column 'ddq2': 'nan' is not a finite number");
+            "log.csv: row 5, column 'ddq2': 'nan' is not a finite number; leave the cell empty where nothing is measured");
   EXPECT_EQ(input_error_of([] {
               problem_of(gappy_log_of({{"ddq2", 4, "lost"}}));
             }),

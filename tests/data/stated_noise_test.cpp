@@ -191,7 +191,8 @@ TEST(StatedNoise, ThatIsNotAPositiveNumberIsNamedByFileLineAndColumn) {
   EXPECT_EQ(refused("0"), fmt::format(fmt::runtime(rule), 0));
   EXPECT_EQ(refused("-0.1"), fmt::format(fmt::runtime(rule), -0.1));
   EXPECT_EQ(refused("inf"), "log.csv:4: column 'ddx_std': 'inf' is not a finite number");
-  EXPECT_EQ(refused("nan"), "log.csv:4: column 'ddx_std': 'nan' is not a finite number");
+  EXPECT_EQ(refused("nan"),
+            "log.csv:4: column 'ddx_std': 'nan' is not a finite number; leave the cell empty where nothing is measured");
   EXPECT_EQ(refused(""), "") << "an empty cell is a value that is not measured";
 }
 

@@ -283,9 +283,39 @@ dx = [-1, 1]
   }
 }
 
-TEST(CSourceTest, NamesOfTheModelMayBeThoseOfFunctionsOfC) {
+// No piece of the C is left without a caller.
+TEST(CSourceTest, APotentialAloneWithoutDeviationsIsCWithoutAWarning) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x"]
+[mechanics]
+mass = [["2"]]
+[[latent]]
+directions = "potential"
+[truth]
+force = ["-x^3"]
+[sampling]
+x = [-1, 1]
+)toml",
+                                   "spring");
+  const View view = View::constrained_acceleration(*model.system);
+  Problem p{model.name, make_prior(model, {Prior::Mean::force, std::nullopt}), {}, {}, test::draw(model, 20, export_seed).states,
+            {}};
+  RandomStream random(export_seed);
+  p.observations.push_back(test::observe(model, view, p.queries, random));
+  p.values = test::random_values(p.prior, p.observations, random);
+  CSourceOptions options;
+  for (const bool jacobian : {false, true}) {
+    options.stddev = false;
+    options.jacobian = jacobian;
+    Exported c(export_c(test::posterior_of(p), view, options), "gp2_model", compiler(0));
+    EXPECT_EQ(c.self_test(c.workspace()), 0);
+  }
+}
+
+TEST(CSourceTest, NamesOfTheModelMayBeThoseOfFunctionsOfCAndWordsOfCpp) {
   const Model model = Model::parse(R"toml(
 coordinates = ["square"]
+inputs      = ["new"]
 [parameters]
 pow    = 2.5
 fabs   = 0.3
@@ -293,7 +323,7 @@ sinf   = 0.7
 FP_NAN = 0.2
 [mechanics]
 mass  = [["2 + sin(square)*sinf"]]
-force = ["-fabs*(square + dsquare + 1)^2 - abs(dsquare)*fabs - FP_NAN*dsquare - (square^2 + 4)^pow"]
+force = ["new - fabs*(square + dsquare + 1)^2 - abs(dsquare)*fabs - FP_NAN*dsquare - (square^2 + 4)^pow"]
 [[latent]]
 features   = ["square", "dsquare"]
 directions = "force"
@@ -302,6 +332,7 @@ force = ["-dsquare"]
 [sampling]
 square  = [-1, 1]
 dsquare = [-1, 1]
+new     = [-1, 1]
 )toml",
                                    "names");
   const View view = View::constrained_acceleration(*model.system);
@@ -314,8 +345,13 @@ dsquare = [-1, 1]
   for (const bool portable : {false, true}) {
     CSourceOptions options;
     options.portable_math = portable;
-    Exported c(export_c(posterior, view, options), "gp2_model", "gcc -O2 -ffp-contract=off");
+    const CSource source = export_c(posterior, view, options);
+    Exported c(source, "gp2_model", "gcc -O2 -ffp-contract=off");
     EXPECT_EQ(c.self_test(c.workspace()), 0) << portable;
+    const test::TemporaryFolder folder;
+    static_cast<void>(folder.write("gp2_model.h", source.header));
+    const std::filesystem::path cpp = folder.write("gp2_model.cpp", source.source);
+    EXPECT_EQ(std::system(("g++ -fsyntax-only '" + cpp.string() + "'").c_str()), 0) << portable;
   }
 }
 

@@ -326,7 +326,7 @@ TEST(ExportJobTest, SaysWhichOptionsDoNotGoTogether) {
   request.name = "two__underscores";
   EXPECT_THAT(error(request),
               testing::HasSubstr("`name`: CasADi takes names that begin with a letter and have single underscores"));
-  for (const char* const name : {"NQ", "set", "exp"}) {
+  for (const char* const name : {"NQ", "set", "exp", "sqrtf"}) {
     request.name = name;
     EXPECT_EQ(error(request), fmt::format("`name`: the code for CasADi uses '{}' itself; choose another", name));
   }

@@ -99,7 +99,7 @@ class DirectEvaluation {
       case Operation::max:
         return std::isnan(a) || a > b ? a : b;
       case Operation::multiply_or_zero:
-        return a == 0 ? 0 : a * b;
+        return std::abs(a) < 1e-100 ? 0 : a * b;
       default:
         require(false, "every operation has a meaning");
         return 0;

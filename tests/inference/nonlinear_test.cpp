@@ -1106,6 +1106,18 @@ TEST(NonlinearInducing, MoreObservationsAddToTheSums) {
   EXPECT_EQ(grown.marginal(p.ddq(), states).covariance, got.covariance);
 }
 
+TEST(NonlinearInducing, AStateThatIsAddedWithoutMechanicsIsNamed) {
+  const Model model =
+      Model::parse(test::changed(rubbing_bead("lambda", "se + constant").text, {{"m + 0.3", "m + 0.3 - 0.1*z"}}), "bead");
+  const ThroughPoints p(Fitted(model, 60), 20);
+  const Observations& all = p.fitted.observations.front();
+  MatrixXd states = all.states().leftCols(2);
+  states(1, 1) = 50;
+  const Observations wrong(states, all.view(), all.values().leftCols(2), all.noise().stddev());
+  expect_says([&] { static_cast<void>(update(p.posterior(), wrong)); },
+              {"the mass matrix M is not positive definite at state 2 (x = "});
+}
+
 void expect_nearly_exact(const Fitted& fitted) {
   FitOptions options;
   options.n_restarts = 1;

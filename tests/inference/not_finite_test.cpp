@@ -171,5 +171,29 @@ TEST(Overflow, IsAStatusOfThePredictor) {
   EXPECT_TRUE(mean.array().isNaN().all() && covariance.array().isNaN().all());
 }
 
+// A denormal velocity, say: the row that it scales has no variance, and the other row keeps its own.
+TEST(Underflow, OfADirectionLeavesTheOtherRowAsItIs) {
+  const Prior prior = make_prior(Model::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+[[latent]]
+kernel     = "se"
+features   = ["dy"]
+directions = { force = [["x"], ["1"]] }
+)toml",
+                                              "particle"),
+                                 {Prior::Mean::force, std::nullopt});
+  const View view = View::constrained_acceleration(*prior.system);
+  const std::vector<Observations> observed = {{states_from(prior, 3), view, MatrixXd::Random(2, 3), VectorXd::Constant(2, 0.1)}};
+  const Posterior posterior(prior, observed,
+                            model_values(prior, observed, default_hyperparameters(prior, observed, {}, Protocol())));
+  const MatrixXd at_zero = posterior.marginal(view, states_from(prior, 0)).covariance;
+  EXPECT_GT(at_zero(3, 1), 0);
+  for (const double tiny : {1e-200, 1e-310}) {
+    EXPECT_EQ(posterior.marginal(view, states_from(prior, tiny)).covariance, at_zero) << tiny;
+  }
+}
+
 }  // namespace
 }  // namespace gp2

@@ -137,9 +137,9 @@ TEST(CommandRecord, WhatDependsOnWhatWasBeforeIsPredictedAndNotCompared) {
   EXPECT_EQ(predicted.states.cols(), log.n_rows());
   EXPECT_TRUE(predicted.states.row(3).allFinite());
   EXPECT_THAT(predicted.notes,
-              Contains(HasSubstr("warning: late cart: 22 of 201 rows are predicted as if the inputs had been at rest")));
+              Contains(HasSubstr("warning: late cart: 22 of 201 rows are predicted as if each input had held its first value")));
   EXPECT_EQ(compared.accelerations.array().isNaN().count(), 22);
-  // one that begins at 0, or rests at first, may have been at rest before
+  // one that begins at 0, or is constant at first, may well have held that value before
   const auto notes_from = [&](double first, int n_resting) {
     std::vector<CsvTable::Column> columns;
     for (const std::string& name : log.header()) {
@@ -152,11 +152,22 @@ TEST(CommandRecord, WhatDependsOnWhatWasBeforeIsPredictedAndNotCompared) {
     return read_log_states(prior, view, model, CsvTable::from_columns("log", std::move(columns)), {}).notes;
   };
   const std::string note =
-      "log: 22 of 201 rows as if the inputs had been at rest before: what acts there depends on commands before the log";
+      "log: 22 of 201 rows as if each input had held its first value before: what acts there depends on commands before the log";
   EXPECT_THAT(notes_from(0, 1), Contains(note));
   EXPECT_THAT(notes_from(1e-3, 1), Contains(note));  // as smoothing leaves a 0
   EXPECT_THAT(notes_from(0.7, 30), Contains(note));
   EXPECT_THAT(notes_from(0.7, 5), Contains(HasSubstr("warning: log: 22 of 201 rows are predicted")));
+}
+
+TEST(CommandRecord, AnUnknownStartingValueIsRefusedWithTheNamesOfDelays) {
+  FitRequest request;
+  request.model = late_cart(both);
+  request.logs = {{late_cart_log(0.02, 0.04, 100, 2, 1)}};
+  request.problem.mean = Prior::Mean::force;
+  request.start.values = {{"u.dealy", 0.01}};
+  const std::string error = input_error_of([&] { prepare_fit(std::move(request)); });
+  EXPECT_THAT(error, HasSubstr("`start`: unknown hyperparameter 'u.dealy'; this fit has: "));
+  EXPECT_THAT(error, testing::EndsWith(", u.delay, u.lag"));
 }
 
 // A log without noise has the truth's accelerations, by whatever delays a fit has learned from it.

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <memory>
 #include <numbers>
 #include <optional>
 
@@ -220,6 +221,28 @@ TEST(EvaluateJob, TakesAFactorThatTrainingFoundForStatedNoise) {
   const MatrixXd usual = measurement_noise(posterior, {0, 1}, 2);
   EXPECT_DOUBLE_EQ(usual(0, 1), 2.1);
   EXPECT_TRUE(std::isnan(usual(1, 0))) << "never observed";
+}
+
+// The text of a model names the file of its robot, in which the numbers stand.
+TEST(SystemOfAFit, IsAnotherWhereItsRobotIsThoughTheTextsAreTheSame) {
+  const auto arm = [](double mass) {
+    RobotDescription robot;
+    RobotDescription::Body& link = robot.bodies.emplace_back();
+    link.name = "link";
+    link.mass = mass;
+    link.com = {0, 0, -0.5};
+    link.joints.emplace_back().name = "q";
+    link.joints.back().axis = Eigen::Vector3d::UnitY();
+    return std::make_shared<const Model>(Model::parse("robot = 'arm.urdf'\n[[latent]]\nfeatures = ['dq']\ndirections = 'force'\n",
+                                                      "arm.toml", RobotSource([&](const std::string&) { return robot; })));
+  };
+  const std::shared_ptr<const Model> same = arm(1), heavier = arm(3);
+  FitFile fit;
+  fit.model = *arm(1);
+  const Prior prior = fit.prior();
+  ASSERT_EQ(same->text, heavier->text);
+  EXPECT_EQ(system_of(fit, prior, same).other_system, nullptr);
+  EXPECT_NE(system_of(fit, prior, heavier).other_system, nullptr);
 }
 
 }  // namespace

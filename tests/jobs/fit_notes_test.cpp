@@ -1,4 +1,5 @@
 #include <cmath>
+#include <limits>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -61,6 +62,31 @@ TEST(FitNotes, NameWhatEndedAtABound) {
   // but what is likeliest already has
   report.converged = true;
   EXPECT_THAT(notes_of(report, free), testing::SizeIs(2));
+}
+
+// One that lies far beyond its bound makes the noise so large that the data hardly tell where within its bounds it is.
+TEST(FitNotes, NameABoundBeforeWhatTheDataDoNotDetermine) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
+  FitOptions nothing;
+  nothing.max_iterations = 0;
+  const Posterior posterior = fit(problem_of(constrained_cart(""), log), nothing).posterior;
+  FitReport report;
+  report.iterations = 10;
+  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "m", 2, 0.5, 2),
+                            hyperparameter(Hyperparameter::Kind::parameter, "k", 1, 0.5, 2)};
+  constexpr double infinity = std::numeric_limits<double>::infinity();
+  LaplaceUncertainty& uncertainty = report.uncertainty.emplace();
+  uncertainty.stddev = Eigen::Vector2d(infinity, 0.1);
+  uncertainty.correlation = Eigen::Matrix2d::Identity();
+  uncertainty.undetermined = Eigen::Vector2d(1, 0);
+  const std::vector<std::string> notes = notes_of(report, posterior);
+  ASSERT_GE(notes.size(), 2U);
+  EXPECT_THAT(notes[0], StartsWith("warning: m ended at its bound, 2."));
+  EXPECT_THAT(notes[1], StartsWith("warning: the data do not determine m."));
+  // where another makes up for it any value is as good
+  uncertainty.stddev[1] = infinity;
+  uncertainty.undetermined = Eigen::Vector2d(1, 1).normalized();
+  EXPECT_THAT(notes_of(report, posterior), Not(Contains(HasSubstr("ended at its bound"))));
 }
 
 TEST(FitNotes, NameStatedDeviationsThatAreFarTooSmall) {

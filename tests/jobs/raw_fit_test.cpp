@@ -269,6 +269,14 @@ TEST(LearnedLog, ItsFitNamesLinesOfTheRawLogAndListsItsFile) {
   }
 }
 
+TEST(LearnedLog, IsNotBlamedForRatesThatNobodyMeasured) {
+  const FitRequest asked = request_of_slider();
+  LearnedLog learned = learn_and_smooth(asked, slider_log("x"), {.most_passes = 0, .windows = false});
+  learned.data.accelerations *= -1;  // sensors that contradict the constraints among them make such ones
+  EXPECT_THAT(prepare_raw_fit(learned, asked, "log").problem.notes,
+              testing::Not(testing::Contains(HasSubstr("is not the rate of"))));
+}
+
 TEST(LearnedLog, KeepsNamesOfColumnsOfSideInformation) {
   FitRequest asked = request_of_slider();
   asked.problem.columns = {{"x", "place"}};

@@ -226,6 +226,23 @@ TEST(StartOfALog, IsMoreThanATime) {
             "`start`: inputs.csv has none of the columns x, y, a, dx, dy, da");
 }
 
+// A table of arrays is called as its errors begin.
+TEST(StartOfALog, NamesTheInputsOnce) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x"]
+inputs = ["u"]
+[mechanics]
+mass  = [["1"]]
+force = ["u"]
+)toml",
+                                   "cart.toml");
+  SimulateRequest request;
+  request.start = std::map<std::string, double>{{"x", 0}};
+  request.times = VectorXd::LinSpaced(2, 0, 1);
+  request.inputs = CsvTable::parse("t,u\n0,1\n0,2\n", "inputs");
+  EXPECT_EQ(test::input_error_of([&] { prepare_simulation(model, request); }), "inputs: times must increase, but 0 follows 0");
+}
+
 // y is open, x and a are given too many
 TEST(StartOfALog, OfRoundedCoordinatesSolvesForTheOthersNearThem) {
   SimulateRequest request;

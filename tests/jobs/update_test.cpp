@@ -381,6 +381,20 @@ TEST(UpdateJob, AWindowStrikesTheLogsOfWhichNothingIsLeft) {
   EXPECT_THAT(names_under(20, "g.csv", 7), testing::ElementsAre("f.csv", "g.csv"));
 }
 
+// Rows without a file are not those of the file before them.
+TEST(UpdateJob, RowsOfArraysCountOnTheirOwn) {
+  const test::TemporaryFolder folder;
+  log_of(30, 1).write(folder / "a.csv");
+  const CsvTable file = CsvTable::read(folder / "a.csv"), rows = log_of(5, 2);
+  UpdateRequest newest;
+  newest.window = 10;
+  const FitFile fit = update(fit_of(file), {rows, log_of(6, 3)}, newest).fit;
+  ASSERT_EQ(fit.logs.size(), 1U);
+  EXPECT_EQ(fit.logs[0].name, rows.name());
+  EXPECT_EQ(fit.logs[0].n_learned, 10);
+  EXPECT_FALSE(fit.has_learned(*file.file()));
+}
+
 TEST(UpdateJob, AFitToWindowsOfARawLogTakesNoWindow) {
   FitFile fit = fit_of(log_of(30, 1));
   const Observations& all = fit.observations.front();
@@ -486,6 +500,19 @@ TEST(UpdateJob, TheNoiseOfMoreIsWhatItsLogStatesAsInTheFit) {
               HasSubstr("has its own noise; give that of the new ones in a column ddx_std"));
 }
 
+TEST(UpdateJob, NamesTheRowWhoseMechanicsAreNotDefined) {
+  const Model model = Model::parse(test::changed(block("0.05").text, {{R"([["2"]])", R"([["2 - x"]])"}}), "block.toml");
+  const FitFile fit = fit_of_block(model, {block_log("first.csv", 30, -1, "")});
+  const CsvTable log = block_log("more.csv", 10, -1, "");
+  const CsvTable wrong = with_cells(log, log.header(), [](int row, const std::string& column, double value) {
+    if (column == "ddx" && row == 2) return not_a_number;
+    return column == "x" && row == 6 ? 3 : value;
+  });
+  EXPECT_EQ(
+      input_error_of([&] { static_cast<void>(update(fit, {wrong}, {})); }),
+      "more.csv: data row 7: the mass matrix M is not positive definite ('block' with the model's parameters; see gp2 check)");
+}
+
 TEST(UpdateJob, ProjectsWhereTheFitDid) {
   test::LogData log = test::drawn_log(surface, 20, 1), more = test::drawn_log(surface, 5, 2);
   for (test::LogData* one : {&log, &more}) one->states.row(2).array() += 0.01;
@@ -556,6 +583,10 @@ TEST(UpdateJob, RowsFarFromAllInducingPointsAreSaid) {
   UpdateRequest precise;
   precise.noise_stddev = 0.00005;
   EXPECT_TRUE(is_said(update(fit, {near}, precise), "of its rows, since their noise is much smaller than that of the fit"));
+  UpdateRequest silent;
+  silent.noise_stddev = 1e-160;
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(update(fit, {near}, silent)); }),
+              HasSubstr("the noise standard deviation 1e-160 of ddx is too small for double precision"));
   // what they stand for has no rows that could go
   UpdateRequest newest;
   newest.window = 5000;

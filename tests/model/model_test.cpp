@@ -373,6 +373,9 @@ std::vector<Complaint> complaints() {
       {"CoordinateTwice", with_coordinates("[\"q1\", \"q1\"]"), "1: coordinates: the name 'q1' is taken already; choose another"},
       {"CoordinateNamedLikeAVelocity", with_coordinates("[\"q1\", \"dq1\"]"),
        "1: coordinates: the name 'dq1' is taken already; choose another"},
+      {"CoordinateNamedLikeTheEnergy", with_coordinates("[\"energy\", \"q2\"]"),
+       "1: coordinates: the column energy would be a name of this model and what logs and predictions call a quantity of the "
+       "motion; choose another name"},
       {"CoordinateNamedT", with_coordinates("[\"t\"]"), "1: coordinates: the name 't' is taken already; choose another"},
       {"CoordinateNamedLikeAFunction", with_coordinates("[\"sin\"]"),
        "1: coordinates: 'sin' is the name of a function or constant; choose another"},
@@ -668,11 +671,22 @@ std::vector<Complaint> complaints() {
        "8: columns.m: not a coordinate, velocity, acceleration, input or t of this model"},
       {"ColumnIsANumber", base + "[columns]\nq1 = 3\n", "8: columns.q1: expected a text in quotes, got 3"},
       {"ColumnTwice", base + "[columns]\nq1 = \"x\"\nq2 = \"x\"\n", "9: columns.q2: the column 'x' is another name's already"},
+      {"ColumnOfAnotherName", base + "[columns]\nq1 = \"q1\"\nq2 = \"dq1\"\n",
+       "9: columns.q2: the column 'dq1' has the name of another quantity of this model, and in files that gp2 writes it is that "
+       "quantity: leave this out, and read logs that are like this with `map=dq1=q2`"},
   };
 }
 
 INSTANTIATE_TEST_SUITE_P(For, RefusedModel, testing::ValuesIn(complaints()),
                          [](const auto& complaint) { return complaint.param.what; });
+
+TEST(Model, OnlyTheMultipliersOfItsRowsAreNamesOfColumns) {
+  const std::string text = replaced(base, "\"u1\"", "\"lambda2\"") + "[constraints]\nposition = [\"q1 - q2\"";
+  EXPECT_EQ(error_of(text + "]\n"), "");
+  EXPECT_EQ(error_of(text + ", \"q1\"]\n"),
+            "m.toml:1: coordinates: the column lambda2 would be a name of this model and what logs and predictions call a "
+            "quantity of the constraints; choose another name");
+}
 
 TEST(Model, ARowGoesByItsName) {
   const Model model = Model::parse(R"toml(

@@ -1,6 +1,7 @@
 """Systems whose mechanics are Python functions."""
 
 import concurrent.futures
+import pickle
 import sys
 import time
 import types
@@ -229,6 +230,32 @@ def test_what_ends_python_is_not_taken_for_a_state_without_mechanics(interrupt):
         gp2.fit(docking(interrupt()), docking_log(), **OPTIONS)
 
 
+def test_a_predictor_of_another_system_of_functions_may_have_many_threads(surface, log):
+    posterior = gp2.fit(surface, log, max_iterations=0)
+    predictor = gp2.Predictor(posterior, system=as_functions(surface))
+    states = surface.states(surface.generate(200, seed=3, noise_std=0))
+    expected = [predictor.mean(state) for state in states]
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        np.testing.assert_array_equal(list(pool.map(predictor.mean, states)), expected)
+
+
+def test_a_fit_that_learned_from_a_system_of_functions_cannot_be_pickled(surface, log):
+    posterior = gp2.fit(surface, [log, gp2.Log(log, as_functions(surface))], max_iterations=0)
+    with pytest.raises(TypeError, match="cannot be pickled: that system has functions"):
+        pickle.dumps(posterior)
+
+
+def test_rows_of_constraints_come_by_level_whatever_the_order_of_the_names():
+    def mechanics(states, _):
+        n = len(states)
+        return np.tile(np.eye(3), (n, 1, 1)), np.tile(np.eye(3)[:2], (n, 1, 1)), np.zeros((n, 2)), np.zeros((n, 3))
+
+    system = gp2.System.from_callables(
+        mechanics, {"velocity": ["rolls"], "position": ["wire"]}, coordinates=["x", "y", "z"], noise=0.1
+    )
+    assert system.constraints == ["wire", "rolls"]
+
+
 def test_what_functions_read_without_declaring_it_is_found(surface, log):
     reads = ["q1", "q2", "dq1", "dq2", "u1", "u2", "u3"]
 
@@ -238,6 +265,21 @@ def test_what_functions_read_without_declaring_it_is_found(surface, log):
     assert findings(reads) == []
     found = findings([name for name in reads if name != "dq2"])
     assert len(found) == 1 and found[0].startswith("declared reads: M, A or b depend on dq2, which mechanics_reads (in Python reads) ")
+
+
+def test_functions_that_return_one_array_for_all_states_are_found():
+    mass = np.zeros((1, 1))
+
+    def mechanics(states, parameters):
+        masses = []
+        for q in states[:, 0]:
+            mass[:] = 2 + np.cos(q)
+            masses.append(mass)
+        return masses, None, None, np.zeros((len(states), 1))
+
+    joint = gp2.System.from_callables(mechanics, coordinates=["q"], reads=["q"], noise=0.1)
+    states = {"q": [0.1, 0.7, 1.3], "dq": [0.0, 0.0, 0.0], "ddq": [0.0, 0.0, 0.0]}
+    assert any("differ when it is asked alone" in one.text for one in gp2.check(joint, states))
 
 
 def test_start_that_is_not_named_whole_is_told_of_without_residuals():

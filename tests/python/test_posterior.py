@@ -176,6 +176,8 @@ def test_a_start_out_of_bounds_is_taken_where_nothing_is_optimised(arm, arm_log,
     start.write_text('{"m2": 2.5}', encoding="utf-8")
     posterior = gp2.fit(arm, arm_log, estimate=["m2"], start=start, max_iterations=0)
     assert posterior.parameters["m2"] == 2.5
+    again = gp2.fit(arm, arm_log, estimate=["m2"], start=posterior.report, max_iterations=0)
+    assert dict(again.report) == dict(posterior.report)
     assert any("m2 = 2.5 is outside its bounds [1, 2]; used" in note for note in posterior.notes)
     with pytest.raises(gp2.InputError, match="m2 = 2.5 is outside its bounds"):
         gp2.fit(arm, arm_log, estimate=["m2"], start=start)
@@ -372,7 +374,7 @@ def test_a_motion_starts_at_the_first_row_of_any_table(posterior, arm, arm_log):
 
 def test_a_system_that_a_file_does_not_need_is_refused(arm, arm_fit_file):
     for call in (gp2.load, gp2.Posterior.load, gp2.fit_again):
-        with pytest.raises(gp2.InputError, match="^system: this fit is all text; to predict under another system, give it to predict"):
+        with pytest.raises(gp2.InputError, match="^system: it has no functions, .* to predict under another system, give it to predict"):
             call(arm_fit_file, system=arm)
 
 

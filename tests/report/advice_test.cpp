@@ -235,6 +235,10 @@ TEST(Advice, JudgesTheCoverageOfTheTestByItsSize) {
   test.n = 1000;
   test.coverage95 = 0.999;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "`noise_std=estimate`")));
+  report.fit.prior_options.baseline = Baseline();  // which refuses that
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "the noise is stated too large.")));
+  report.fit.prior_options.baseline.reset();
   test.coverage95_latent = 0.95;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "free of noise")));
 }

@@ -529,7 +529,8 @@ TEST(Reader, AMeshThatGivesAnInertiaMustBeThere) {
   folder.write("assets.xml", assets);
   for (const std::string& text : {visible("inertiafromgeom=\"true\""), visible("", "")}) {
     EXPECT_THAT(input_error_of([&] { read_robot(folder.write("robot.xml", text)); }),
-                EndsWith(". The file of a mesh, height field or texture is missing: put it there or remove the geom"));
+                EndsWith(". The file of a mesh, height field or texture is missing: put it there, give its body an <inertial>, "
+                         "or remove the geom"));
   }
 }
 
@@ -618,7 +619,8 @@ TEST(ReaderErrors, MujocosRefusalsAreQuotedWithWhatToDo) {
               EndsWith(". No rigid body has such an inertia: correct it"));
   EXPECT_THAT(
       error_of(mjcf(R"(<body><joint/><geom type="mesh" mesh="m"/></body>)", R"(<asset><mesh name="m" file="m.stl"/></asset>)")),
-      EndsWith(". The file of a mesh, height field or texture is missing: put it there or remove the geom"));
+      EndsWith(". The file of a mesh, height field or texture is missing: put it there, give its body an <inertial>, or remove "
+               "the geom"));
 }
 
 TEST(ReaderErrors, AFileForAnotherMujocoIsNamedAsSuch) {

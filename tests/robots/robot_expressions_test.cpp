@@ -529,6 +529,18 @@ d = { of = 'damping("left knee")' }
   EXPECT_EQ(model.system->parameter_values(), Eigen::Vector2d(1.7, 0.2));
 }
 
+TEST(RobotModel, SaysHowAJointIsCalledOtherwise) {
+  const std::filesystem::path path = written(
+      "<mujoco><worldbody><body><joint name=\"exp\"/>"
+      "<inertial pos=\"0 0 0\" mass=\"1\" diaginertia=\"1 1 1\"/></body></worldbody></mujoco>",
+      "reserved.xml");
+  const std::string text = fmt::format("robot = '{}'\n", path.string());
+  EXPECT_EQ(test::input_error_of([&] { Model::parse(text, "arm.toml"); }),
+            "arm.toml:1: robot: 'exp' is the name of a function or constant; choose another, for a joint by coordinates = "
+            "[\"q1\", …], one per joint in the order of the file");
+  EXPECT_NO_THROW(Model::parse(text + "coordinates = ['q1']\n", "arm.toml"));
+}
+
 TEST(RobotModel, SaysWhatIsWrong) {
   const std::string arm = fmt::format("robot = '{}'\n", source_path("experiments/arm_on_surface/iiwa7.xml").string());
   const auto message = [&](const std::string& more) {

@@ -733,13 +733,13 @@ TEST(ContactFriction, OfTwoContactsHoldsToTheLimitOfEach) {
 }
 
 // on two feet, or on the left one alone
-Model box(double mu, bool has_right_foot) {
+Model box(double mu, bool has_right_foot, double w = 0.3, double h = 0.2) {
   return Model::parse(fmt::format(R"toml(
 coordinates = ["x", "z", "a"]
 inputs      = ["l", "r"]
 [parameters]
-w = 0.3
-h = 0.2
+w = {3}
+h = {4}
 [mechanics]
 mass      = [["2", "0", "0"], ["0", "2", "0"], ["0", "0", "0.05"]]
 force     = ["0", "-2*9.81", "0"]
@@ -755,7 +755,7 @@ fr = "{1}"
 force = ["fl + fr", "0", "(h*cos(a) - w*sin(a))*fl + (h*cos(a) + w*sin(a))*fr"]
 )toml",
                                   has_right_foot ? R"x(, { expr = "z - h*cos(a) + w*sin(a)", contact = "r", name = "R" })x" : "",
-                                  has_right_foot ? fmt::format("-{}*abs(lambda(R))*sign(vr)", mu) : "0", mu),
+                                  has_right_foot ? fmt::format("-{}*abs(lambda(R))*sign(vr)", mu) : "0", mu, w, h),
                       "box");
 }
 
@@ -793,6 +793,25 @@ TEST(ContactFriction, OfABoxThatFallsOnItsFeetTakesEnergy) {
         for (Index i = 1; i < 11; ++i) EXPECT_LE(energy(motion.states.col(i)), energy(motion.states.col(i - 1)) + 1e-6);
       }
     }
+  }
+}
+
+// It rocks from foot to foot ever faster, infinitely often. Each impact keeps its moment of momentum about the foot that is hit.
+TEST(ContactFriction, OfABoxThatRocksEndsInRest) {
+  const Model model = box(0.6, true, 0.2, 0.3);
+  for (const double tilt : {-0.2, 0.1, 0.3}) {
+    const double height = 0.3 * std::cos(tilt) + 0.2 * std::sin(std::abs(tilt));
+    const Trajectory motion = motion_of(model, {0, height, tilt, 0, 0, 0}, 2, 21);
+    ASSERT_EQ(motion.states.cols(), 21) << tilt;
+    EXPECT_LT(motion.states.col(20).segment(3, 3).norm(), 1e-12) << tilt;
+    EXPECT_EQ(motion.states.col(20).tail(2), Eigen::Vector2d(1, 1)) << tilt;
+    EXPECT_LT(motion.steps + motion.rejected_steps, 1000) << tilt;
+    std::vector<double> approaches;
+    for (const ContactEvent& event : motion.events) {
+      if (event.kind == ContactEvent::Kind::made && event.approach > 1e-3) approaches.push_back(event.approach);
+    }
+    ASSERT_GT(approaches.size(), 5U) << tilt;
+    for (std::size_t k = 1; k < approaches.size(); ++k) EXPECT_NEAR(approaches[k] / approaches[k - 1], 0.15 / 0.31, 1e-3) << tilt;
   }
 }
 

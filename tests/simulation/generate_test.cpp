@@ -391,6 +391,17 @@ TEST(GenerateMotion, ABodyThatDryFrictionHoldsIsAtRest) {
   EXPECT_LT(n_held, 98);
 }
 
+TEST(GenerateMotion, ATruthThatIsStiffIsRefusedSoonWithTheMend) {
+  const Model model = driven("[\"u\"]", "[truth]\nforce = [\"-1e8*dx\"]\n");
+  try {
+    noise_free(model, 100);
+    FAIL() << "20000 steps per sample were enough";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(), AllOf(StartsWith("simulate: 20000 steps reach no further than t = "),
+                                    EndsWith("choose other targets of [motion], longer segments, or a smoother [truth]")));
+  }
+}
+
 TEST(GenerateMotion, DoesNotDriveThroughContacts) {
   EXPECT_EQ(
       error_of(driven("[\"u\", \"touch\"]",

@@ -482,6 +482,23 @@ TEST(SimulateDryFriction, InAPlaneOfTwoContactsHoldsEachByItsOwnLimit) {
   ASSERT_EQ(out.sticks.size(), 2);
 }
 
+TEST(SimulateDryFriction, AlongDirectionsThatAreNearlyOneIsThatOfOne) {
+  const auto motion = [](const std::string& apart) {
+    const Model model = bodies({"x", "y"}, {fmt::format("4.37*sin(2.58*t) - 2.55*sign(dx) - 0.34*sign(dx + {}*dy)", apart),
+                                            "4.5*cos(1.88*t) - 1.5*y + x"});
+    const Trajectory out =
+        simulate_switching(model, state_of(model, {{"dx", 0.3}, {"dy", -0.2}}), with_tolerance(times(6, 61), 1e-9));
+    EXPECT_LT(out.steps + out.rejected_steps, 1000) << apart;
+    return MatrixXd(out.states.topRows(4));
+  };
+  const MatrixXd of_one = motion("0");
+  for (const std::string apart : {"1e-10", "1e-8", "3e-8", "1e-7"}) {
+    const MatrixXd states = motion(apart);
+    ASSERT_EQ(states.cols(), of_one.cols()) << apart;
+    EXPECT_LT((states - of_one).cwiseAbs().maxCoeff(), 1e-5) << apart;
+  }
+}
+
 TEST(SimulateUnfinished, SaysWhatWasReached) {
   const Model model = oscillator();
   SimulateOptions options = with_tolerance(times(100, 101), 1e-9);

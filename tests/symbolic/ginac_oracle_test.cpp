@@ -88,7 +88,7 @@ class BoundedEvaluation {
       case Operation::multiply:
         return rounded(u * v, std::abs(u) * b.error + std::abs(v) * a.error);
       case Operation::multiply_or_zero:
-        return rounded(u == 0 ? 0 : u * v, std::abs(u) * b.error + std::abs(v) * a.error);
+        return rounded(std::abs(u) < 1e-100 ? 0 : u * v, std::abs(u) * b.error + std::abs(v) * a.error);
       case Operation::divide:
         return rounded(u / v, (a.error + std::abs(u / v) * b.error) / std::abs(v));
       case Operation::power: {

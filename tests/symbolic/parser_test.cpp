@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <chrono>
 #include <clocale>
+#include <limits>
 
 #include <gtest/gtest.h>
 
@@ -279,6 +280,17 @@ TEST_F(ParserTest, AComponentOverItsLengthIsZeroAtZero) {
   };
   for (const std::string text : {"q1/abs(q1)", "q1/sqrt(q1^2 + q2^2)", "q2/sqrt(q1^2 + q2^2)"}) EXPECT_EQ(slope(text, 0, 0), 0);
   EXPECT_DOUBLE_EQ(slope("q1/sqrt(q1^2 + q2^2)", 0, 2), 0.5);
+  // a velocity that dies away has a direction all the way, though its square is 0 before it is
+  for (double v = 1e-3; v > 0; v /= 2) {
+    for (const std::string text : {"q1/abs(q1)", "q1/sqrt(q1^2 + q2^2)"}) {
+      for (const double w : {0.0, v}) {
+        const double value = test::evaluate(read(text), {{"q1", v}, {"q2", w}});
+        EXPECT_TRUE(value >= 0 && value <= 1 + 1e-15) << text << " at " << v << ", " << w << ": " << value;
+        EXPECT_TRUE(std::isfinite(slope(text, v, w))) << text << " at " << v << ", " << w << ": " << slope(text, v, w);
+      }
+    }
+    EXPECT_NEAR(slope("q1/abs(q1)", v, 0), 0, 4 * std::numeric_limits<double>::epsilon() / v);
+  }
   EXPECT_NEAR(slope("q1/sqrt(q1^2 + q2^2)", 3, 4), 16.0 / 125, 1e-15);
   // parts that are shared are looked at once
   Expression shared = graph.variable("q1");

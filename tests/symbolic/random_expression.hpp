@@ -73,7 +73,7 @@ inline double evaluate(Expression e, const std::map<std::string, double>& values
     const double u = evaluate(f.left(), values);
     if (f.operation() == Operation::abs) return std::abs(u);
     if (f.operation() == Operation::sign) return std::isnan(u) ? u : (u > 0) - (u < 0);
-    if (f.operation() == Operation::multiply_or_zero && u == 0) return 0;
+    if (f.operation() == Operation::multiply_or_zero && std::abs(u) < 1e-100) return 0;
     const double v = evaluate(f.right(), values);
     if (f.operation() == Operation::multiply_or_zero) return u * v;
     if (f.operation() == Operation::atan2) return std::atan2(u, v);

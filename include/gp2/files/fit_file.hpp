@@ -39,9 +39,10 @@ struct FitFile {
 
   Model model;
   FitPriorOptions prior_options;
-  std::string library;        // version that wrote the file; empty: it is not from one
-  std::string data_source;    // where the data came from, for people
-  std::vector<LogFile> logs;  // that it was learned from, as far as they are files
+  std::string library;      // version that wrote the file; empty: it is not from one
+  std::string data_source;  // where the data came from, for people
+  /// What it was learned from, as far as that is files; rows that were added from arrays stand there without a checksum.
+  std::vector<LogFile> logs;
   std::vector<Observations> observations;
   /// Per Observations: the model file of its view's other system; null where it has none. May be shorter.
   std::vector<std::shared_ptr<const Model>> systems;
@@ -83,7 +84,8 @@ std::map<std::string, double> read_start_values(const std::filesystem::path& pat
                                                 const std::vector<std::string>& others = {});
 /// The same from values at hand.
 /// @param source  stands for them in messages
+/// @param others  names that the caller takes too, which the error of an unknown one lists
 void set_start_values(const std::map<std::string, double>& values, const std::string& source,
-                      std::vector<Hyperparameter>& hyperparameters);
+                      std::vector<Hyperparameter>& hyperparameters, const std::vector<std::string>& others = {});
 
 }  // namespace gp2

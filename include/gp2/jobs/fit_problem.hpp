@@ -42,6 +42,7 @@ struct Log {
   std::shared_ptr<const Model> model = nullptr;      // of that system; null: the model that is fitted
   bool is_commanded = true;                          // its inputs are commands; else they are what acts
   std::shared_ptr<const Windows> windows = nullptr;  // to learn from instead of the rows
+  bool is_smoothed = false;  // its velocities and accelerations are no measurements but follow from positions
 };
 
 /// Another quantity that is measured or known at some states: the columns of its rows that the table holds, at least one.

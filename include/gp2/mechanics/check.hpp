@@ -83,6 +83,7 @@ struct ConstraintResidual {
   double size = 0;         // of |A| |ddq| + |b|, root mean square
   std::vector<int> worst;  // states with the largest r, in units of the expected one where that is known; at most three
   int n_outliers = 0;      // states, at most one in twenty, without which r is noise; 0: r is noise, or too large at many states
+  std::vector<int> lines = {};  // in its log of each state, by which the worst are named; empty: they are named as rows, from 1
 
   /// Whether r is more than noise: more than twice what is expected, beyond what chance does to n values; where the noise is not
   /// known, an offset that stands out of the scatter, or half as large as the terms that should cancel.

@@ -51,8 +51,8 @@ enum class Operation : std::uint8_t {
   atan2,  // atan2(a, b)
   min,
   max,
-  /// a · b, but 0 wherever a = 0, whatever b is. It appears in derivatives, d√u = u̇ ⊗ 1/(2√u) is 0, not NaN, along a direction
-  /// in which u does not change, and in rows of constraints that come and go.
+  /// a · b, but 0 wherever |a| < 1e-100, whatever b is. It appears in derivatives, d√u = u̇ ⊗ 1/(2√u) is 0, not NaN, along a
+  /// direction in which u does not change, in a component over its length, and in rows of constraints that come and go.
   multiply_or_zero,
 };
 

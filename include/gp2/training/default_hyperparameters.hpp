@@ -55,6 +55,10 @@ struct Scales {
 /// @throws InputError when the observations are not of the prior, or nothing is measured.
 Scales default_scales(const Prior& prior, const std::vector<Observations>& observations);
 
+/// That a fit by the standard protocol can estimate a parameter of the system.
+/// @throws InputError for an unknown name, a parameter in a feature of a latent, and one of value 0 without bounds
+void require_estimable(const Prior& prior, const std::string& name);
+
 /// Everything tunable: kernels and signals of every latent, noise where it is estimated, and the named parameters of the system.
 ///
 /// @param estimated  names of system parameters to estimate
