@@ -2,9 +2,9 @@
 
     PYTHONPATH=build/test/python python3 experiments/friction.py --n 100 --seeds 1 20
 
-Two mechanisms whose load is that under the known force, and three whose friction presses on its own constraint. Each model is fitted to
-the same N noisy rows with the known force as mean, and scored on 300 fresh states without noise and on the same at twice the velocities:
-nRMSE, median and worst seed. Coverage is, for all seeds and for the worst, of the first two that of the accelerations' 95 % bands, also at
+Two mechanisms whose load is that under the known force, each with three friction curves, and three whose friction presses on its own
+constraint. Each model is fitted to the same N noisy rows with the known force as mean, and scored on 300 fresh states without noise and on
+the same at twice the velocities: nRMSE, median and worst seed. Coverage is, for all seeds and for the worst, of the first two that of the accelerations' 95 % bands, also at
 twice the velocities; of the three that of the friction coefficient over the speeds of the fresh states: how often the true one is within
 two standard deviations.
 """
@@ -22,6 +22,8 @@ ALONG = {
                              '["-rx/v"], ["-ry/v"], ["-dz/v"]'),
     "finger_on_plate": ('"x", "y", "dx", "dy", "fx", "fy", "fz", "v"', '["-dx/v"], ["-dy/v"], ["-dz/v"]'),
 }
+# That of the mechanism's file, and others for the same model.
+CURVES = [None, "0.12 + 0.18*exp(-v/0.25)", "0.1 + 0.2*exp(-v/0.1) + 0.05*tanh(v/0.5)"]
 MECHANISMS = [*ALONG, "rubbing_bead", "dragged_rod", "ladder"]
 
 
@@ -31,8 +33,12 @@ def with_latent(text, features, directions):
     return f'{head}[[latent]]\nname = "friction"\nfeatures = [{features}]\ndirections = {directions}\n{tail}'
 
 
-def models(mechanism):
+def text_of(mechanism, curve):
     text = (FOLDER / f"{mechanism}.toml").read_text()
+    return re.sub(r"^mu .*", f'mu = "{curve}"', text, flags=re.M) if curve else text
+
+
+def models(mechanism, text):
     coordinates, inputs = (re.findall(r'"(\w+)"', re.search(rf"^{key}.*", text, re.M)[0]) for key in ("coordinates", "inputs"))
     features = ", ".join(f'"{name}"' for name in [*coordinates, *("d" + c for c in coordinates), *inputs])
     any_force = with_latent(text, features, '"force"')
@@ -90,13 +96,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, nargs="+", default=[100])
     parser.add_argument("--seeds", type=int, nargs=2, default=[1, 20], help="first and last")
+    parser.add_argument("--mechanisms", nargs="+", default=MECHANISMS)
     arguments = parser.parse_args()
-    for mechanism in MECHANISMS:
-        systems = {name: gp2.System.parse(text, f"{mechanism}: {name}") for name, text in models(mechanism).items()}
+    for mechanism, curve in ((m, c) for m in arguments.mechanisms for c in (CURVES if m in ALONG else [None])):
+        own_text = text_of(mechanism, curve)
+        systems = {name: gp2.System.parse(text, f"{mechanism}: {name}") for name, text in models(mechanism, own_text).items()}
         own = "lambda0" if mechanism in ALONG else "lambda"
         truth = systems[own]
         fast = re.sub(r"^(d\w+ *= *)\[(.*), (.*)\]", lambda m: f"{m[1]}[{2 * float(m[2])}, {2 * float(m[3])}]",
-                      (FOLDER / f"{mechanism}.toml").read_text(), flags=re.M)
+                      own_text, flags=re.M)
         tests = [system.generate(300, seed=1000, noise_std=0) for system in (truth, gp2.System.parse(fast, "fast"))]
         for n in arguments.n:
             errors, covered = {name: [[], []] for name in systems}, [[], []]
@@ -114,7 +122,7 @@ def main():
                         covered[0].append(coverage(posterior, mechanism, tests[0]))
             text = " | ".join(" · ".join(f"{statistics.median(e):.2g} ({max(e):.2g})" for e in errors[name]) for name in systems)
             shares = " · ".join(f"{statistics.mean(of):.3f} ({min(of):.2f})" for of in covered if of)
-            print(f"| {mechanism} | {n} | {text} | {shares} |", flush=True)
+            print(f"| {mechanism} | {curve or 'its own'} | {n} | {text} | {shares} |", flush=True)
 
 
 if __name__ == "__main__":

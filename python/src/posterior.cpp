@@ -375,11 +375,12 @@ void save(const PyPosterior& self, const py::object& path) {
   const std::filesystem::path to = path_argument(path);
   unlocked([&] { file.write(to); });
   std::vector<std::string> notes;
-  if (self.file.model.code && std::ranges::any_of(file.systems, [](const auto& one) { return one && one->code; })) {
+  if (self.file.model.code && std::ranges::any_of(file.systems, [&](const auto& one) {
+        return one && one->code && one->system != self.file.model.system;
+      })) {
     notes.emplace_back(
         "warning: several systems of this fit are functions, but gp2.load takes one: the file is read only if their functions "
-        "are the "
-        "same");
+        "are the same");
   }
   tell(notes);
 }
@@ -708,9 +709,9 @@ FitFile read_fit(const py::object& path, const PySystem* system) {
   const ModelCode code = code_of(system);
   if (system != nullptr && !code) {
     throw InputError(
-        "system: it has no functions, which is all that a file cannot hold: load without it, or with the system of the fit; to "
-        "predict "
-        "under another system, give it to predict(…, system=)");
+        "system: it has no functions, which is all that a file cannot hold: load without it, or with the system whose functions "
+        "the "
+        "fit used; to predict under another system, give it to predict(…, system=)");
   }
   return unlocked([&] { return FitFile::read(from, code); });
 }

@@ -110,13 +110,11 @@ class TileColumn {
 }  // namespace
 
 void assemble(const LatentRows& rows, int n_threads, Ref<MatrixXd> K, const std::atomic<bool>* stop) {
-  const int n_tiles = static_cast<int>((rows.n_samples() + tile_size - 1) / tile_size);
-  parallel_for(n_tiles, n_threads, [&](int column, int) {
-    const Index J = column * tile_size;
+  for_each_block(rows.n_samples(), tile_size, n_threads, [&](Index J, Index, int) {
     TileColumn tiles(rows, J, K);
     for (Index I = J; I < rows.n_samples() && !is_set(stop); I += tile_size) tiles.write_tile(I);
   });
-  if (has_potential(rows)) add_potentials(rows, n_threads, K, stop);
+  add_potentials(rows, n_threads, K, stop);
 }
 
 }  // namespace gp2

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cassert>
-#include <utility>
 
 #include <Eigen/Cholesky>
 
@@ -54,19 +53,24 @@ std::optional<GramValue> DenseGram::differentiate(const RowBlocks& blocks, const
   return value;
 }
 
+bool factorise_covariance(const LatentRows& rows, int n_threads, MatrixXd& of_rows, GrowingCholesky& factor,
+                          const std::atomic<bool>* stop) {
+  const std::optional<Sums>& sums = rows.reduction->sums;
+  if (sums) {
+    of_rows.resize(rows.size(), rows.size());
+    assemble(rows, n_threads, of_rows, stop);
+    sums->of_rows(of_rows, factor.lower());
+  } else {
+    assemble(rows, n_threads, factor.lower(), stop);
+  }
+  factor.lower().diagonal().array() += 1;
+  return !is_set(stop) && factor.factorise(rows.reduction->y, stop);
+}
+
 std::optional<GramValue> DenseGram::factorise(const LatentRows& rows) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
-  const std::optional<Sums>& sums = rows.reduction->sums;
   factor_.resize(rows.reduction->n_measured());
-  if (sums) {
-    of_rows_.resize(rows.size(), rows.size());
-    assemble(rows, n_threads(rows), of_rows_, stop_);
-    sums->of_rows(of_rows_, factor_.lower());
-  } else {
-    assemble(rows, n_threads(rows), factor_.lower(), stop_);
-  }
-  factor_.lower().diagonal().array() += 1;
-  if (is_set(stop_) || !factor_.factorise(rows.reduction->y, stop_)) return std::nullopt;
+  if (!factorise_covariance(rows, n_threads(rows), of_rows_, factor_, stop_)) return std::nullopt;
   return GramValue{0.5 * factor_.z().squaredNorm(), factor_.log_det_half(), rows.reduction->constant};
 }
 
@@ -84,7 +88,7 @@ GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<
 LatentPosterior::Inverse DenseGram::invert(const LatentRows& rows, const LatentPosterior::SampleSets& states,
                                            const LatentPosterior::SampleSets& sets) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
-  LatentPosterior::Inverse inverse{factor_.solve(), {}, {}};
+  LatentPosterior::Inverse inverse{factor_.solve(), {}, {}, VectorXd::Ones(rows.n_samples())};
   const Ref<const MatrixXd> P = factor_.invert();
   const Reduction& reduction = *rows.reduction;
   const auto block = [&](const std::vector<Index>& of) {

@@ -9,6 +9,13 @@
 
 namespace gp2 {
 
+/// Factors K̃ + I of rows, or of the sums of them that are measured, with y: false where it is not positive definite.
+/// @param of_rows  memory for K̃ of rows of which sums are measured
+/// @param factor   of the size of what is measured
+/// @param stop     set: gives up, and is false
+[[nodiscard]] bool factorise_covariance(const LatentRows& rows, int n_threads, Eigen::MatrixXd& of_rows, GrowingCholesky& factor,
+                                        const std::atomic<bool>* stop = nullptr);
+
 /// K̃ + I = L Lᵀ, exactly: O(n³) operations and O(n²) memory for n reduced rows.
 class DenseGram final : public Gram {
  public:
@@ -66,8 +73,6 @@ class DensePosterior final : public LatentPosterior {
   void append_basis(const LatentRows& more);
   // α̃ of the rows
   [[nodiscard]] Eigen::VectorXd weights_of_rows(Eigen::VectorXd alpha) const;
-  // β_j = Z_jᵀ α̃_j (n_rows × F)
-  [[nodiscard]] Eigen::MatrixXd latent_weights(std::size_t a, const Eigen::VectorXd& alpha) const;
   void refresh_weights();
 
   Eigen::Index n_samples_ = 0;

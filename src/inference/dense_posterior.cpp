@@ -64,16 +64,7 @@ MatrixXd DensePosterior::triangle_rows(Index first, Index n) const {
 // ỹ − Σ_a Z_a f̃_a − ε
 VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {
   VectorXd misfit = sums_ ? VectorXd(VectorXd::Zero(n_rows())) : y_;
-  for (std::size_t a = 0; a < latents_.size(); ++a) {
-    const Index n_functions = latents_[a].n_functions;
-    for (Index j = 0; j < n_samples_; ++j) {
-      for (std::size_t c = 0; c < row_of_.size(); ++c) {
-        const Index row = row_of_[c][static_cast<std::size_t>(j)];
-        if (row < 0) continue;
-        misfit[row] -= latents_[a].Z.row(j).segment(static_cast<Index>(c) * n_functions, n_functions) * f[a].col(j);
-      }
-    }
-  }
+  subtract_functions(f, misfit);
   if (sums_) {
     misfit = (sums_->D * misfit).eval();
     sums_->whiten(misfit);
@@ -86,11 +77,7 @@ VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& ra
 std::vector<std::vector<MatrixXd>> DensePosterior::weights(MatrixXd alpha) const {
   lapack::solve_factored(factor_.L(), alpha);
   std::vector<std::vector<MatrixXd>> weights;
-  for (Index column = 0; column < alpha.cols(); ++column) {
-    std::vector<MatrixXd>& of_column = weights.emplace_back();
-    const VectorXd of_rows = weights_of_rows(alpha.col(column));
-    for (std::size_t a = 0; a < latents_.size(); ++a) of_column.push_back(latent_weights(a, of_rows));
-  }
+  for (const auto& column : alpha.colwise()) weights.push_back(latent_weights(weights_of_rows(column)));
   return weights;
 }
 
@@ -98,24 +85,9 @@ VectorXd DensePosterior::weights_of_rows(VectorXd alpha) const {
   return sums_ ? sums_->weights_of_rows(std::move(alpha)) : alpha;
 }
 
-MatrixXd DensePosterior::latent_weights(std::size_t a, const VectorXd& alpha) const {
-  const Basis& latent = latents_[a];
-  const Index n_functions = latent.n_functions;
-  MatrixXd weights = MatrixXd::Zero(latent.kernel.n_rows(), n_functions);
-  for (std::size_t c = 0; c < row_of_.size(); ++c) {
-    const auto Z = latent.Z.middleCols(static_cast<Index>(c) * n_functions, n_functions);
-    for (std::size_t j = 0; j < row_of_[c].size(); ++j) {
-      if (row_of_[c][j] < 0) continue;
-      const Index row = static_cast<Index>(j);
-      for (Index l = 0; l < n_functions; ++l) weights(row, l) += Z(row, l) * alpha[row_of_[c][j]];
-    }
-  }
-  return weights;
-}
-
 void DensePosterior::refresh_weights() {
-  const VectorXd alpha = weights_of_rows(factor_.solve());
-  for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = latent_weights(a, alpha);
+  std::vector<MatrixXd> beta = latent_weights(weights_of_rows(factor_.solve()));
+  for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = std::move(beta[a]);
 }
 
 LatentPosterior::Inverse DensePosterior::invert(const LatentRows& rows, const SampleSets& states, const SampleSets& sets) const {
@@ -137,19 +109,11 @@ bool DensePosterior::append(const LatentRows& more) {
 }
 
 bool DensePosterior::factorise(const LatentRows& rows) {
-  const std::optional<Sums>& sums = rows.reduction->sums;
   GrowingCholesky factor(rows.reduction->n_measured());
-  if (sums) {
-    MatrixXd of_rows(rows.size(), rows.size());
-    assemble(rows, 1, of_rows);
-    sums->of_rows(of_rows, factor.lower());
-  } else {
-    assemble(rows, 1, factor.lower());
-  }
-  factor.lower().diagonal().array() += 1;
-  if (!factor.factorise(rows.reduction->y)) return false;
+  MatrixXd of_rows;
+  if (!factorise_covariance(rows, 1, of_rows, factor)) return false;
   factor_ = std::move(factor);
-  sums_ = sums;
+  sums_ = rows.reduction->sums;
   return true;
 }
 

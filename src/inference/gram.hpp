@@ -111,7 +111,7 @@ class LatentPosterior {
     Eigen::VectorXd alpha;                // α̃
     std::vector<Eigen::MatrixXd> blocks;  // P_BB of each state, the rows of its samples one sample after another
     std::vector<WithoutSet> without;      // per set; empty where double precision cannot tell
-    Eigen::VectorXd noise = {};           // s² of each sample where local latents count as noise (theory.md, T38); empty: 1
+    Eigen::VectorXd noise;                // s² of each sample: 1, but where local latents count as noise (theory.md, T38)
   };
   using SampleSets = std::vector<std::vector<Eigen::Index>>;
   /// @param rows    of the observations that it is conditioned on, or of some of them, which are in `sets` as they were then
@@ -123,6 +123,11 @@ class LatentPosterior {
   LatentPosterior() = default;
   LatentPosterior(const LatentPosterior&) = default;
   LatentPosterior& operator=(const LatentPosterior&) = delete;
+
+  /// Σ_c Z_jᵀ α_c,j per latent (n_rows × F), α of the rows.
+  [[nodiscard]] std::vector<Eigen::MatrixXd> latent_weights(const Eigen::VectorXd& alpha) const;
+  /// Takes Σ_a Z_a f_a from the rows, f at the points of the basis, per latent (F × points).
+  void subtract_functions(const std::vector<Eigen::MatrixXd>& f, Eigen::VectorXd& rows) const;
 
   std::vector<Basis> latents_;
   std::vector<std::vector<Eigen::Index>> row_of_;

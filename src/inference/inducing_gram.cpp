@@ -65,7 +65,57 @@ struct BlockDerivatives {
   /// @param mean_of_variables  B⁻¹c
   /// @param explained          in_pairs(I − B⁻¹)
   void move_to(const InducingLatents& latents, const InducingBlock& block, const VectorXd& mean_of_variables,
-               const MatrixXd& explained);
+               const MatrixXd& explained) {
+    const std::vector<InducingLatents::Function>& functions = latents.functions();
+    const Index n = block.n();
+    alpha = block.misfit(mean_of_variables);
+    const Index n_components = alpha.cols();
+    U.resize(latents.n_crosses());
+    V.resize(functions.size());
+    mean.resize(functions.size());
+    for (std::size_t f = 0; f < functions.size(); ++f) {
+      const MatrixXd& w = block.w(f);
+      const InducingLatents::OfLatent& latent = latents.latent_of(functions[f]);
+      const auto mean_of_f = mean_of_variables.segment(functions[f].first, w.rows());
+      mean[f].noalias() = w.transpose() * mean_of_f;
+      ArrayXd beta = ArrayXd::Zero(n);
+      V[f].resize(n, n_components);
+      for (Index c = 0; c < n_components; ++c) {
+        const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(f, c).array();
+        beta += weight * alpha_c;
+        V[f].col(c) = weight * block.variance(f).array() - alpha_c * mean[f].array();
+      }
+      MatrixXd& u = U[functions[f].cross];
+      if (f == 0 || functions[f - 1].cross != functions[f].cross)
+        u.setZero(latent.is_potential ? w.rows() : latent.kernel.n_rows(), n);
+      u.topRows(w.rows()).noalias() -= mean_of_f * beta.matrix().transpose();
+    }
+    product.resize(latents.size(), n);
+    for (std::size_t g = 0; g < functions.size(); ++g) {
+      const MatrixXd& w = block.w(g);
+      const auto add_rows = [&](Index first, Index end) {
+        auto rows = product.middleRows(first, end - first);
+        rows.setZero();
+        lapack::add_product(explained.block(first, functions[g].first, end - first, w.rows()), false, w, false, rows);
+      };
+      const auto next_latent = std::ranges::find_if(functions, [&](const auto& f) { return f.latent > functions[g].latent; });
+      add_rows(0, functions[g].first + w.rows());
+      if (next_latent != functions.end()) add_rows(next_latent->first, latents.size());
+      for (std::size_t f = 0; f < functions.size(); ++f) {
+        const bool is_pair = f != g && functions[f].cross == functions[g].cross;
+        if (is_pair && f > g) continue;
+        const MatrixXd& v = block.w(f);
+        const auto of_f = product.middleRows(functions[f].first, v.rows());
+        U[functions[f].cross].topRows(v.rows()) -= of_f * block.weight_product(f, g).matrix().asDiagonal();
+        VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
+        if (is_pair) explained_by_g *= 0.5;
+        for (Index c = 0; c < n_components; ++c) {
+          V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
+          if (is_pair) V[g].col(c) -= block.weight(f, c).cwiseProduct(explained_by_g);
+        }
+      }
+    }
+  }
 };
 
 // Two functions f < g with the same w need E_fg w and E_gf w = E_fgᵀ w in the same sums: E_fg + E_fgᵀ in the place of E_fg.
@@ -80,59 +130,6 @@ MatrixXd in_pairs(const InducingLatents& latents, MatrixXd E) {
     }
   }
   return E;
-}
-
-void BlockDerivatives::move_to(const InducingLatents& latents, const InducingBlock& block, const VectorXd& mean_of_variables,
-                               const MatrixXd& explained) {
-  const std::vector<InducingLatents::Function>& functions = latents.functions();
-  const Index n = block.n();
-  alpha = block.misfit(mean_of_variables);
-  const Index n_components = alpha.cols();
-  U.resize(latents.n_crosses());
-  V.resize(functions.size());
-  mean.resize(functions.size());
-  for (std::size_t f = 0; f < functions.size(); ++f) {
-    const MatrixXd& w = block.w(f);
-    const InducingLatents::OfLatent& latent = latents.latent_of(functions[f]);
-    const auto mean_of_f = mean_of_variables.segment(functions[f].first, w.rows());
-    mean[f].noalias() = w.transpose() * mean_of_f;
-    ArrayXd beta = ArrayXd::Zero(n);
-    V[f].resize(n, n_components);
-    for (Index c = 0; c < n_components; ++c) {
-      const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(f, c).array();
-      beta += weight * alpha_c;
-      V[f].col(c) = weight * block.variance(f).array() - alpha_c * mean[f].array();
-    }
-    MatrixXd& u = U[functions[f].cross];
-    if (f == 0 || functions[f - 1].cross != functions[f].cross)
-      u.setZero(latent.is_potential ? w.rows() : latent.kernel.n_rows(), n);
-    u.topRows(w.rows()).noalias() -= mean_of_f * beta.matrix().transpose();
-  }
-  product.resize(latents.size(), n);
-  for (std::size_t g = 0; g < functions.size(); ++g) {
-    const MatrixXd& w = block.w(g);
-    const auto add_rows = [&](Index first, Index end) {
-      auto rows = product.middleRows(first, end - first);
-      rows.setZero();
-      lapack::add_product(explained.block(first, functions[g].first, end - first, w.rows()), false, w, false, rows);
-    };
-    const auto next_latent = std::ranges::find_if(functions, [&](const auto& f) { return f.latent > functions[g].latent; });
-    add_rows(0, functions[g].first + w.rows());
-    if (next_latent != functions.end()) add_rows(next_latent->first, latents.size());
-    for (std::size_t f = 0; f < functions.size(); ++f) {
-      const bool is_pair = f != g && functions[f].cross == functions[g].cross;
-      if (is_pair && f > g) continue;
-      const MatrixXd& v = block.w(f);
-      const auto of_f = product.middleRows(functions[f].first, v.rows());
-      U[functions[f].cross].topRows(v.rows()) -= of_f * block.weight_product(f, g).matrix().asDiagonal();
-      VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
-      if (is_pair) explained_by_g *= 0.5;
-      for (Index c = 0; c < n_components; ++c) {
-        V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
-        if (is_pair) V[g].col(c) -= block.weight(f, c).cwiseProduct(explained_by_g);
-      }
-    }
-  }
 }
 
 /// Sums over rows of which the gradient consists.

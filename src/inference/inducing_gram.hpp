@@ -78,8 +78,6 @@ class InducingPosterior final : public LatentPosterior {
   [[nodiscard]] Inverse invert(const LatentRows& rows, const SampleSets& states, const SampleSets& sets) const override;
 
  private:
-  [[nodiscard]] std::vector<Eigen::MatrixXd> latent_weights(const Eigen::Ref<const Eigen::VectorXd>& of_variables) const;
-
   InducingLatents inducing_;
   std::vector<InducingStatistics> stretches_;
   InducingStatistics all_;

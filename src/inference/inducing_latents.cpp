@@ -1,7 +1,6 @@
 #include "inference/inducing_latents.hpp"
 
 #include <algorithm>
-#include <functional>
 
 #include <Eigen/Cholesky>
 
@@ -217,18 +216,9 @@ InducingStatistics::InducingStatistics(const InducingLatents& latents)
 
 std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& latents, const RowBlocks& rows,
                                                          const Workers& workers, const std::atomic<bool>* stop) {
-  struct Sum {
-    InducingStatistics of_blocks;
-    MatrixXd memory = {};
-    void add(const Sum& other) { of_blocks.add(other.of_blocks); }
-    void for_each(const std::function<void(double*, Index)>& take) { of_blocks.for_each(take); }
-  };
-  std::optional<Sum> sum = sum_over_blocks(latents, rows, false, workers, stop, Sum{InducingStatistics(latents)},
-                                           [&](Sum& sum_of_piece, int, const RowBlock&, const InducingBlock& block) {
-                                             sum_of_piece.of_blocks.add(latents, block, sum_of_piece.memory);
-                                           });
-  if (!sum) return std::nullopt;
-  return std::move(sum->of_blocks);
+  return sum_over_blocks(
+      latents, rows, false, workers, stop, InducingStatistics(latents),
+      [&](InducingStatistics& sum, int, const RowBlock&, const InducingBlock& block) { sum.add(latents, block); });
 }
 
 void InducingStatistics::add(const InducingStatistics& other, double share) {
@@ -240,11 +230,12 @@ void InducingStatistics::add(const InducingStatistics& other, double share) {
   weight += share * other.weight;
 }
 
-void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block, MatrixXd& memory) {
+void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block) {
   const std::vector<InducingLatents::Function>& functions = latents.functions();
   const auto is_potential = [&](std::size_t f) { return latents.latent_of(functions[f]).is_potential; };
   // each component of a sample sees another combination of a potential's derivatives: its variables have loadings by component
   std::vector<MatrixXd> Psi;
+  MatrixXd weighted;
   const bool has_potential = std::ranges::any_of(latents.latents(), &InducingLatents::OfLatent::is_potential);
   for (Index k = 0; has_potential && k < block.y().cols(); ++k) Psi.push_back(block.loadings(k));
   for (std::size_t f = 0; f < functions.size(); ++f) {
@@ -264,24 +255,24 @@ void InducingStatistics::add(const InducingLatents& latents, const InducingBlock
       if (is_potential(f) || is_potential(g)) {
         if (is_potential(g) && functions[g].index > 0) continue;
         for (const MatrixXd& of_component : Psi) {
-          memory = of_component.middleRows(functions[g].first, v.rows());
+          weighted = of_component.middleRows(functions[g].first, v.rows());
           if (f == g) {
-            lapack::add_square(memory, to);
+            lapack::add_square(weighted, to);
           } else {
-            lapack::add_product(of_component.middleRows(functions[f].first, w.rows()), false, memory, true, to);
+            lapack::add_product(of_component.middleRows(functions[f].first, w.rows()), false, weighted, true, to);
           }
         }
         continue;
       }
       const ArrayXd product = f == g ? ArrayXd(square.sqrt()) : block.weight_product(f, g);
       if ((product == 0).all()) continue;
-      memory = v * product.matrix().asDiagonal();
+      weighted = v * product.matrix().asDiagonal();
       if (f == g) {
-        lapack::add_square(memory, to);
+        lapack::add_square(weighted, to);
       } else if (functions[f].cross == functions[g].cross) {
-        lapack::add_symmetric_product(w, memory, to);
+        lapack::add_symmetric_product(w, weighted, to);
       } else {
-        lapack::add_product(w, false, memory, true, to);
+        lapack::add_product(w, false, weighted, true, to);
       }
     }
   }

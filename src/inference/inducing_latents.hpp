@@ -190,8 +190,7 @@ struct InducingStatistics {
     for (Eigen::VectorXd* vector : {&c, &weight}) work(vector->data(), vector->size());
   }
   /// Adds a block of samples.
-  /// @param memory  that is used again
-  void add(const InducingLatents& latents, const InducingBlock& block, Eigen::MatrixXd& memory);
+  void add(const InducingLatents& latents, const InducingBlock& block);
 };
 
 }  // namespace gp2

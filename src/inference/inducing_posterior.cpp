@@ -5,7 +5,6 @@
 
 #include "base/lapack.hpp"
 #include "inference/inducing_gram.hpp"
-#include "prior/padded_rows.hpp"
 
 namespace gp2 {
 
@@ -85,18 +84,6 @@ bool InducingPosterior::factorise() {
   return true;
 }
 
-std::vector<MatrixXd> InducingPosterior::latent_weights(const Ref<const VectorXd>& of_variables) const {
-  std::vector<MatrixXd> weights;
-  for (const Basis& latent : latents_) weights.emplace_back(MatrixXd::Zero(latent.kernel.n_rows(), latent.n_functions));
-  for (std::size_t f = 0; f < row_of_.size(); ++f) {
-    const InducingLatents::Function& function = inducing_.functions()[f];
-    for (std::size_t j = 0; j < row_of_[f].size(); ++j) {
-      if (row_of_[f][j] >= 0) weights[function.latent](static_cast<Index>(j), function.index) = of_variables[row_of_[f][j]];
-    }
-  }
-  return weights;
-}
-
 GramValue InducingPosterior::value() const {
   const double explained = (L_.transpose().triangularView<Eigen::Upper>() * mean_).squaredNorm();  // cᵀB⁻¹c
   return {0.5 * (all_.yy - explained), L_.diagonal().array().log().sum() + 0.5 * all_.trace, all_.constant};
@@ -108,23 +95,18 @@ MatrixXd InducingPosterior::triangle_rows(Index first, Index n) const { return X
 
 // B⁻¹c + L_B⁻ᵀε − L⁻¹f̃(Z): of the whitened variables, those of the function drawn from the posterior less those of f̃
 VectorXd InducingPosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {
-  VectorXd drawn(size()), of_prior(size());
+  VectorXd drawn(size()), less_prior = VectorXd::Zero(size());
   for (double& entry : drawn) entry = random.normal();
   lapack::solve_lower(L_, true, drawn);
-  for (std::size_t k = 0; k < row_of_.size(); ++k) {
-    const InducingLatents::Function& function = inducing_.functions()[k];
-    for (std::size_t j = 0; j < row_of_[k].size(); ++j) {
-      if (row_of_[k][j] >= 0) of_prior[row_of_[k][j]] = f[function.latent](function.index, static_cast<Index>(j));
-    }
-  }
-  inducing_.solve(false, of_prior);
-  return mean_ + drawn - of_prior;
+  subtract_functions(f, less_prior);
+  inducing_.solve(false, less_prior);
+  return mean_ + drawn + less_prior;
 }
 
 std::vector<std::vector<MatrixXd>> InducingPosterior::weights(MatrixXd misfits) const {
   inducing_.solve(true, misfits);
   std::vector<std::vector<MatrixXd>> weights;
-  for (Index column = 0; column < misfits.cols(); ++column) weights.push_back(latent_weights(misfits.col(column)));
+  for (const auto& column : misfits.colwise()) weights.push_back(latent_weights(column));
   return weights;
 }
 

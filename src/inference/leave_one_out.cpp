@@ -4,7 +4,6 @@
 #include <cmath>
 #include <functional>
 #include <map>
-#include <numeric>
 #include <optional>
 #include <set>
 #include <string>
@@ -166,12 +165,12 @@ struct StateRows {
 
 StateRows rows_of_state(const Posterior::Implementation& self, const Reduction& reduction,
                         const LatentPosterior::Inverse& inverse, const std::vector<Index>& samples, const MatrixXd& block) {
-  StateRows of{VectorXd(block.rows()), VectorXd::Ones(block.rows()), inverse.alpha(rows_of_samples(reduction, samples)), block};
+  StateRows of{VectorXd(block.rows()), VectorXd(block.rows()), inverse.alpha(rows_of_samples(reduction, samples)), block};
   Index first = 0;
   for (const Index s : samples) {
     const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
     of.share.segment(first, sample.R.rows()).setConstant(share_of(self, sample));
-    if (inverse.noise.size() > 0) of.s2.segment(first, sample.R.rows()).setConstant(inverse.noise[s]);
+    of.s2.segment(first, sample.R.rows()).setConstant(inverse.noise[s]);
     first += sample.R.rows();
   }
   if ((of.share.array() != 1).any()) {
@@ -232,9 +231,8 @@ OfComponent leave_out_states(const Posterior& posterior, const Posterior::Implem
     for (const Index s : states[k]) {
       const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
       const Index rank = sample.R.rows();
-      const double share = share_of(self, sample), s2 = inverse.noise.size() > 0 ? inverse.noise[s] : 1;
-      add_values(posterior, sample, of.alpha.segment(first, rank), of.P.block(first, first, rank, rank), share, s2,
-                 out.left_out.values);
+      add_values(posterior, sample, of.alpha.segment(first, rank), of.P.block(first, first, rank, rank), share_of(self, sample),
+                 inverse.noise[s], out.left_out.values);
       first += rank;
     }
     add_row(posterior, reduction, states[k], of, out);
@@ -287,17 +285,24 @@ LeaveOneOut mixed(const std::vector<const LeaveOneOut*>& of,
 class WithoutSums {
  public:
   WithoutSums(const Posterior& posterior, const Posterior::Implementation& self, const Reduction& reduction)
-      : posterior_(posterior), self_(self), reduction_(reduction) {
-    MatrixXd X = MatrixXd::Identity(self_.latents->size(), self_.latents->size());
-    self_.latents->whiten(X);
+      : posterior_(posterior), reduction_(reduction) {
+    MatrixXd X = MatrixXd::Identity(self.latents->size(), self.latents->size());
+    self.latents->whiten(X);
     P_.noalias() = X.triangularView<Eigen::Lower>().transpose() * X;
     alpha_ = P_ * (reduction.sums->L * reduction.y);
+    for (const Observations& group : posterior.observations()) {
+      Query query = make_query(self, group.view(), group.states());
+      query.linearise_at_mean(self);
+      const std::vector<MatrixXd> loadings = query.loadings(self);
+      MatrixXd cross(self.latents->size(), query.n_rows() * query.size());
+      LatentSums(*self.latents).evaluate(query.features, query.needed, &loadings, &cross);
+      all_.push_back({posterior.marginal(group.view(), group.states()), P_ * cross});
+    }
   }
 
   /// @param sets  of samples, of each of which all is predicted from what is no sum over any of them
   [[nodiscard]] std::vector<LeaveOneOut> leave_out(const std::vector<std::vector<Index>>& sets) const {
     std::vector<LeaveOneOut> out = unknown(posterior_.observations());
-    const std::vector<Prediction> all = predictions();
     std::vector<std::vector<Index>> sums_of_row(static_cast<std::size_t>(reduction_.size()));
     const auto& D = reduction_.sums->D;
     for (Index r = 0; r < D.rows(); ++r) {
@@ -319,12 +324,12 @@ class WithoutSums {
         const auto g = static_cast<std::size_t>(sample.group);
         const Observations& group = posterior_.observations()[g];
         const Index d = group.view().size();
-        const MatrixXd Pc = all[g].P_cross.middleCols(d * sample.index, d)(B, Eigen::all), white = factor.matrixL().solve(Pc);
+        const MatrixXd Pc = all_[g].P_cross.middleCols(d * sample.index, d)(B, Eigen::all), white = factor.matrixL().solve(Pc);
         for (Index k = 0; k < d; ++k) {
           if (std::isnan(group.values()(k, sample.index))) continue;
-          out[g].mean(k, sample.index) = all[g].marginal.mean(k, sample.index) - Pc.col(k).dot(pull);
+          out[g].mean(k, sample.index) = all_[g].marginal.mean(k, sample.index) - Pc.col(k).dot(pull);
           out[g].variance(k, sample.index) =
-              std::max(0.0, all[g].marginal.covariance(k * (d + 1), sample.index) + white.col(k).squaredNorm());
+              std::max(0.0, all_[g].marginal.covariance(k * (d + 1), sample.index) + white.col(k).squaredNorm());
         }
       }
     }
@@ -337,23 +342,9 @@ class WithoutSums {
     MatrixXd P_cross;
   };
 
-  // at the states of every Observations
-  [[nodiscard]] std::vector<Prediction> predictions() const {
-    std::vector<Prediction> out;
-    for (const Observations& group : posterior_.observations()) {
-      Query query = make_query(self_, group.view(), group.states());
-      query.linearise_at_mean(self_);
-      const std::vector<MatrixXd> loadings = query.loadings(self_);
-      MatrixXd cross(self_.latents->size(), query.n_rows() * query.size());
-      LatentSums(*self_.latents).evaluate(query.features, query.needed, &loadings, &cross);
-      out.push_back({posterior_.marginal(group.view(), group.states()), P_ * cross});
-    }
-    return out;
-  }
-
   const Posterior& posterior_;
-  const Posterior::Implementation& self_;
   const Reduction& reduction_;
+  std::vector<Prediction> all_;  // at the states of every Observations
   MatrixXd P_;
   VectorXd alpha_;
 };

@@ -17,6 +17,28 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+namespace {
+
+// ∂NLL/∂C of a free loading
+// @param D  R_i E_a, by component
+MatrixXd loading_gradient(const GramGradient::OfLatent& of_gram, bool alike, const MatrixXd& D, Index n_components,
+                          const MatrixXd& C) {
+  const Index p = C.rows(), m = C.cols();
+  if (alike) {
+    // ½ Dᵀ(G + Gᵀ)D C, G the sums of each pair of components, D the first sample's directions
+    const MatrixXd D_first = D.row(0).reshaped(p, n_components).transpose();
+    const MatrixXd G = of_gram.columns.reshaped(n_components, n_components);
+    return 0.5 * D_first.transpose() * (G + G.transpose()) * D_first * C;
+  }
+  MatrixXd gradient = MatrixXd::Zero(p, m);
+  for (Index c = 0; c < n_components; ++c) {
+    gradient.noalias() += D.block(0, c * p, of_gram.V.rows(), p).transpose() * of_gram.V.middleCols(c * m, m);
+  }
+  return gradient;
+}
+
+}  // namespace
+
 struct Likelihood::Implementation {
   Prior prior;
   std::vector<Observations> observations;
@@ -33,16 +55,97 @@ struct Likelihood::Implementation {
   std::vector<VectorXd> initial_noise_stddev;
   std::shared_ptr<const char> identity = std::make_shared<const char>();
 
-  // what is made once, under the values that nothing changes
-  void prepare(const ModelValues& initial);
-  void prepare_blocks(const ModelValues& initial);
   // whether derivatives at single samples are asked for
   [[nodiscard]] bool differentiates_samples() const { return options.noise_gradient || !options.gradient_parameters.empty(); }
-  [[nodiscard]] std::vector<GramGradientParts> parts(const Reduction* reduction, const ModelValues& values) const;
+
+  // what is made once, under the values that nothing changes
+  void prepare(const ModelValues& initial) {
+    features = features_by_group(prior, observations);
+    std::vector<ObservationModel> models = require_models(prior, observations, initial.parameters, initial.about.get());
+    Reduction reduction;
+    reduce(prior, observations, models, initial.noise_stddev, reduction);
+    initial_size = static_cast<int>(reduction.size());
+    if (!options.gradient_parameters.empty()) return;
+    if (!options.noise_gradient) fixed_reduction = std::move(reduction);
+    fixed_models = std::move(models);
+  }
+
+  void prepare_blocks(const ModelValues& initial) {
+    const BlocksOfStates blocks(prior, observations, initial, about.get());
+    const Index n = blocks.n_blocks();
+    std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(n));
+    std::atomic<std::size_t> bytes = 0;
+    std::atomic<bool> is_sound = true;
+    std::atomic<int> size = 0;
+    const Pieces pieces(n);
+    parallel_for(pieces.n, options.workers.n_threads, [&](int piece, int) {
+      if (!options.workers.owns(piece, pieces.n)) return;
+      RowBlocks::Memory memory;
+      for (Index b = pieces.first(piece); b < pieces.first(piece + 1) && is_sound; ++b) {
+        const RowBlock* const block = blocks.block(b, false, memory);
+        if (block == nullptr) {
+          is_sound = false;
+          return;
+        }
+        size += static_cast<int>(block->rows.size());
+        if (!options.gradient_parameters.empty() || bytes > BlocksOfStates::most_kept_bytes) continue;
+        BlocksOfStates::Kept& of_block = kept[static_cast<std::size_t>(b)] = blocks.keep(*block, !options.noise_gradient);
+        bytes += of_block.bytes();
+      }
+    });
+    if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, about.get()));  // names the state
+    initial_size = static_cast<int>(options.workers.sum(size));
+    if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
+  }
+
   // that what was reduced once is as it was
-  void require_initial(const ModelValues& values) const;
+  void require_initial(const ModelValues& values) const {
+    if (!options.gradient_parameters.empty()) return;  // all is reduced anew
+    if (values.parameters != initial_parameters) {
+      throw InputError(
+          "values: parameters of a likelihood that gives no derivative in them must be those that it was made with; make "
+          "another, or name one in gradient_parameters");
+    }
+    if (options.noise_gradient || values.noise_stddev == initial_noise_stddev) return;
+    throw InputError(
+        "values: noise_stddev of a likelihood that gives no derivative in it must be that which it was made with; make "
+        "another, or set noise_gradient");
+  }
+
+  // @param reduction  of all rows; null: through inducing points
+  [[nodiscard]] std::vector<GramGradientParts> parts(const Reduction* reduction, const ModelValues& values) const {
+    std::vector<GramGradientParts> parts;
+    for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+      const Latent& latent = prior.latents[a];
+      GramGradientParts& part = parts.emplace_back();
+      part.kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
+      part.alike = reduction != nullptr && reduction->same_directions[a] && !differentiates_samples() && !latent.is_potential;
+      part.V = differentiates_samples() || (values.has_free_loading(a) && !part.alike);
+      part.mean = differentiates_samples();
+    }
+    return parts;
+  }
+
   // adds what belongs to the rows of a block
-  void add_rows(const RowBlock& block, const GramGradient& of_rows, const ModelValues& values, ModelGradient& gradient) const;
+  void add_rows(const RowBlock& block, const GramGradient& of_rows, const ModelValues& values, ModelGradient& gradient) const {
+    const Reduction& reduction = *block.rows.reduction;
+    for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+      if (!values.has_free_loading(a) || of_rows.latents[a].columns.size() + of_rows.latents[a].V.size() == 0) continue;
+      const bool is_alike = of_rows.latents[a].V.size() == 0;
+      gradient.free_loading[a] += loading_gradient(of_rows.latents[a], is_alike, by_component(reduction, reduction.directions[a]),
+                                                   reduction.n_components(), values.loading(a));
+    }
+    if (!differentiates_samples()) return;
+    // T13
+    SampleGradient of_sample(options, block, values, of_rows);
+    for (Index i = 0; i < reduction.n_samples(); ++i) of_sample.add(i, gradient);
+    if (reduction.sums && options.noise_gradient) {
+      for (Index r = 0; r < reduction.sums->size(); ++r) {
+        const Sums::Of& of = reduction.sums->of[static_cast<std::size_t>(r)];
+        if (of.group >= 0) gradient.log_noise_stddev[static_cast<std::size_t>(of.group)][of.row] += of_rows.log_noise[r];
+      }
+    }
+  }
 };
 
 struct Likelihood::Workspace::Implementation {
@@ -61,84 +164,63 @@ struct Likelihood::Workspace::Implementation {
 
   RowBlock whole;
   std::vector<std::pair<int, int>> sample_ids;  // (group, index) of the samples in `whole`
-  std::vector<MatrixXd> D;                      // per latent: R_i E_a, by component
 
   // all rows under these values; false where the mechanics have a fault
-  [[nodiscard]] bool move_to(const Likelihood::Implementation& self, const ModelValues& values, bool with_derivatives);
+  [[nodiscard]] bool move_to(const Likelihood::Implementation& self, const ModelValues& values, bool with_derivatives) {
+    if (owner != self.identity) {
+      modelled.resize(0);
+      whole = {};
+      owner = self.identity;
+    }
+    whole.models = models(self, values.parameters, with_derivatives);
+    if (whole.models == nullptr) return false;
+    whole.observations = &self.observations;
+    if (!self.fixed_reduction) reduce(self.prior, self.observations, *whole.models, values.noise_stddev, own_reduction);
+    update_rows(self, self.fixed_reduction ? *self.fixed_reduction : own_reduction, values);
+    return true;
+  }
+
   // null where the mechanics have a fault
   [[nodiscard]] const std::vector<ObservationModel>* models(const Likelihood::Implementation& self, const VectorXd& parameters,
-                                                            bool with_derivatives);
-  [[nodiscard]] const Reduction& reduction(const Likelihood::Implementation& self, const std::vector<ObservationModel>& models,
-                                           const ModelValues& values);
-  void update_rows(const Likelihood::Implementation& self, const Reduction& reduction, const ModelValues& values);
-};
-
-bool Likelihood::Workspace::Implementation::move_to(const Likelihood::Implementation& self, const ModelValues& values,
-                                                    bool with_derivatives) {
-  if (owner != self.identity) {
+                                                            bool with_derivatives) {
+    if (self.fixed_models) return &*self.fixed_models;
+    if (modelled.size() > 0 && modelled == parameters && (has_derivatives || !with_derivatives)) return &own_models;
     modelled.resize(0);
-    whole = {};
-    owner = self.identity;
+    const std::vector<int> in = with_derivatives ? self.options.gradient_parameters : std::vector<int>{};
+    if (model_observations(self.prior, self.observations, parameters, in, self.about.get(), own_models)) return nullptr;
+    modelled = parameters;
+    has_derivatives = with_derivatives;
+    return &own_models;
   }
-  whole.models = models(self, values.parameters, with_derivatives);
-  if (whole.models == nullptr) return false;
-  whole.observations = &self.observations;
-  update_rows(self, reduction(self, *whole.models, values), values);
-  return true;
-}
 
-const std::vector<ObservationModel>* Likelihood::Workspace::Implementation::models(const Likelihood::Implementation& self,
-                                                                                   const VectorXd& parameters,
-                                                                                   bool with_derivatives) {
-  if (self.fixed_models) return &*self.fixed_models;
-  if (modelled.size() > 0 && modelled == parameters && (has_derivatives || !with_derivatives)) return &own_models;
-  modelled.resize(0);
-  const std::vector<int> in = with_derivatives ? self.options.gradient_parameters : std::vector<int>{};
-  if (!model_observations(self.prior, self.observations, parameters, in, self.about.get(), own_models)) return nullptr;
-  modelled = parameters;
-  has_derivatives = with_derivatives;
-  return &own_models;
-}
-
-const Reduction& Likelihood::Workspace::Implementation::reduction(const Likelihood::Implementation& self,
-                                                                  const std::vector<ObservationModel>& models,
-                                                                  const ModelValues& values) {
-  if (self.fixed_reduction) return *self.fixed_reduction;
-  reduce(self.prior, self.observations, models, values.noise_stddev, own_reduction);
-  return own_reduction;
-}
-
-void Likelihood::Workspace::Implementation::update_rows(const Likelihood::Implementation& self, const Reduction& reduction,
-                                                        const ModelValues& values) {
-  LatentRows& rows = whole.rows;
-  const std::size_t n_latents = self.prior.latents.size();
-  std::vector<std::pair<int, int>> ids;
-  ids.reserve(reduction.samples.size());
-  for (const Reduction::Sample& sample : reduction.samples) ids.emplace_back(sample.group, sample.index);
-  const bool reordered = rows.reduction == nullptr || ids != sample_ids;
-  if (reordered) {
-    const std::vector<MatrixXd> features = sorted_features(self.prior, self.features, reduction);
-    rows.latents.clear();
+  void update_rows(const Likelihood::Implementation& self, const Reduction& reduction, const ModelValues& values) {
+    LatentRows& rows = whole.rows;
+    const std::size_t n_latents = self.prior.latents.size();
+    std::vector<std::pair<int, int>> ids;
+    ids.reserve(reduction.samples.size());
+    for (const Reduction::Sample& sample : reduction.samples) ids.emplace_back(sample.group, sample.index);
+    if (rows.reduction == nullptr || ids != sample_ids) {
+      const std::vector<MatrixXd> features = sorted_features(self.prior, self.features, reduction);
+      rows.latents.clear();
+      for (std::size_t a = 0; a < n_latents; ++a) {
+        rows.latents.push_back(
+            {KernelColumns(self.prior.latents[a].kernel, features[a]), {}, 0, self.prior.latents[a].is_potential});
+      }
+      sample_ids = std::move(ids);
+    }
+    rows.reduction = &reduction;
     for (std::size_t a = 0; a < n_latents; ++a) {
-      rows.latents.push_back(
-          {KernelColumns(self.prior.latents[a].kernel, features[a]), {}, 0, self.prior.latents[a].is_potential});
-    }
-    sample_ids = std::move(ids);
-  }
-  rows.reduction = &reduction;
-  D.resize(n_latents);
-  for (std::size_t a = 0; a < n_latents; ++a) {
-    LatentRows::OfLatent& latent = rows.latents[a];
-    latent.kernel.set_parameters(values.kernel[a]);
-    if (reordered || !self.fixed_reduction) D[a] = by_component(reduction, reduction.directions[a]);
-    const MatrixXd C = values.loading(a);
-    latent.n_functions = C.cols();
-    latent.Z.resize(D[a].rows(), reduction.n_components() * C.cols());
-    for (Index c = 0; c < reduction.n_components(); ++c) {
-      latent.Z.middleCols(c * C.cols(), C.cols()).noalias() = D[a].middleCols(c * C.rows(), C.rows()) * C;
+      LatentRows::OfLatent& latent = rows.latents[a];
+      latent.kernel.set_parameters(values.kernel[a]);
+      const MatrixXd D = by_component(reduction, reduction.directions[a]), C = values.loading(a);
+      latent.n_functions = C.cols();
+      latent.Z.resize(D.rows(), reduction.n_components() * C.cols());
+      for (Index c = 0; c < reduction.n_components(); ++c) {
+        latent.Z.middleCols(c * C.cols(), C.cols()).noalias() = D.middleCols(c * C.rows(), C.rows()) * C;
+      }
     }
   }
-}
+};
 
 Likelihood::Workspace::Workspace(const Workers& workers, const std::atomic<bool>* stop)
     : implementation_(std::make_unique<Implementation>(workers, stop)) {}
@@ -164,58 +246,6 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   }
 }
 
-void Likelihood::Implementation::prepare(const ModelValues& initial) {
-  features = features_by_group(prior, observations);
-  std::vector<ObservationModel> models = require_models(prior, observations, initial.parameters, initial.about.get());
-  Reduction reduction;
-  reduce(prior, observations, models, initial.noise_stddev, reduction);
-  initial_size = static_cast<int>(reduction.size());
-  if (!options.gradient_parameters.empty()) return;
-  if (!options.noise_gradient) fixed_reduction = std::move(reduction);
-  fixed_models = std::move(models);
-}
-
-void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
-  const BlocksOfStates blocks(prior, observations, initial, about.get());
-  const Index n = blocks.n_blocks();
-  std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(n));
-  std::atomic<std::size_t> bytes = 0;
-  std::atomic<bool> is_sound = true;
-  std::atomic<int> size = 0;
-  const Pieces pieces(n);
-  parallel_for(pieces.n, options.workers.n_threads, [&](int piece, int) {
-    if (!options.workers.owns(piece, pieces.n)) return;
-    RowBlocks::Memory memory;
-    for (Index b = pieces.first(piece); b < pieces.first(piece + 1) && is_sound; ++b) {
-      const RowBlock* const block = blocks.block(b, false, memory);
-      if (block == nullptr) {
-        is_sound = false;
-        return;
-      }
-      size += static_cast<int>(block->rows.size());
-      if (!options.gradient_parameters.empty() || bytes > BlocksOfStates::most_kept_bytes) continue;
-      BlocksOfStates::Kept& of_block = kept[static_cast<std::size_t>(b)] = blocks.keep(*block, !options.noise_gradient);
-      bytes += of_block.bytes();
-    }
-  });
-  if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, about.get()));  // names the state
-  initial_size = static_cast<int>(options.workers.sum(size));
-  if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
-}
-
-void Likelihood::Implementation::require_initial(const ModelValues& values) const {
-  if (!options.gradient_parameters.empty()) return;  // all is reduced anew
-  if (values.parameters != initial_parameters) {
-    throw InputError(
-        "values: parameters of a likelihood that gives no derivative in them must be those that it was made with; make "
-        "another, or name one in gradient_parameters");
-  }
-  if (options.noise_gradient || values.noise_stddev == initial_noise_stddev) return;
-  throw InputError(
-      "values: noise_stddev of a likelihood that gives no derivative in it must be that which it was made with; make another, or "
-      "set noise_gradient");
-}
-
 Likelihood::~Likelihood() = default;
 Likelihood::Likelihood(Likelihood&&) noexcept = default;
 
@@ -223,63 +253,6 @@ const Likelihood::Implementation& Likelihood::implementation() const { return re
 const Prior& Likelihood::prior() const { return implementation().prior; }
 const std::vector<Observations>& Likelihood::observations() const { return implementation().observations; }
 int Likelihood::reduced_size() const { return implementation().initial_size; }
-
-// @param reduction  of all rows; null: through inducing points
-std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction* reduction, const ModelValues& values) const {
-  std::vector<GramGradientParts> parts;
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    const Latent& latent = prior.latents[a];
-    GramGradientParts& part = parts.emplace_back();
-    part.kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
-    part.alike = reduction != nullptr && reduction->same_directions[a] && !differentiates_samples() && !latent.is_potential;
-    part.V = differentiates_samples() || (values.has_free_loading(a) && !part.alike);
-    part.mean = differentiates_samples();
-  }
-  return parts;
-}
-
-namespace {
-
-// ∂NLL/∂C of a free loading
-// @param D  R_i E_a, by component
-MatrixXd loading_gradient(const GramGradient::OfLatent& of_gram, bool alike, const MatrixXd& D, Index n_components,
-                          const MatrixXd& C) {
-  const Index p = C.rows(), m = C.cols();
-  if (alike) {
-    // ½ Dᵀ(G + Gᵀ)D C, G the sums of each pair of components, D the first sample's directions
-    const MatrixXd D_first = D.row(0).reshaped(p, n_components).transpose();
-    const MatrixXd G = of_gram.columns.reshaped(n_components, n_components);
-    return 0.5 * D_first.transpose() * (G + G.transpose()) * D_first * C;
-  }
-  MatrixXd gradient = MatrixXd::Zero(p, m);
-  for (Index c = 0; c < n_components; ++c) {
-    gradient.noalias() += D.block(0, c * p, of_gram.V.rows(), p).transpose() * of_gram.V.middleCols(c * m, m);
-  }
-  return gradient;
-}
-
-}  // namespace
-
-void Likelihood::Implementation::add_rows(const RowBlock& block, const GramGradient& of_rows, const ModelValues& values,
-                                          ModelGradient& gradient) const {
-  const Reduction& reduction = *block.rows.reduction;
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    if (!values.has_free_loading(a) || of_rows.latents[a].columns.size() + of_rows.latents[a].V.size() == 0) continue;
-    const bool is_alike = of_rows.latents[a].V.size() == 0;
-    gradient.free_loading[a] += loading_gradient(of_rows.latents[a], is_alike, by_component(reduction, reduction.directions[a]),
-                                                 reduction.n_components(), values.loading(a));
-  }
-  if (!differentiates_samples()) return;
-  // T13
-  SampleGradient of_sample(options, block, values, of_rows);
-  for (Index i = 0; i < reduction.n_samples(); ++i) of_sample.add(i, gradient);
-  if (reduction.sums && options.noise_gradient) {
-    for (Index r = 0; r < reduction.sums->size(); ++r) {
-      const Sums::Of& of = reduction.sums->of[static_cast<std::size_t>(r)];
-      if (of.group >= 0) gradient.log_noise_stddev[static_cast<std::size_t>(of.group)][of.row] += of_rows.log_noise[r];
-    }
-  }
-}
 
 double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const {
   constexpr double infinity = std::numeric_limits<double>::infinity();

@@ -8,7 +8,6 @@
 
 namespace gp2 {
 
-using Eigen::Index;
 using Eigen::Map;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;

@@ -11,7 +11,6 @@
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
-#include "inference/dense_gram.hpp"
 #include "inference/inducing_latents.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/nonlinear_motion.hpp"
@@ -63,10 +62,10 @@ class ExactFit {
     for (const Observations& group : self.observations) {
       OfGroup& of = groups_.emplace_back();
       const Prior& there = prior_of(self.prior, group.view());
-      of.parameters = parameters_of(group.view(), self.values.parameters);
-      of.mechanics = std::make_unique<MechanicsBatch>(require_mechanics(there, group.view(), group.states(), of.parameters));
-      of.motion = std::make_unique<NonlinearMotion>(there, group.states(), of.parameters, *of.mechanics,
-                                                    require_prior_values(there, group.states(), of.parameters, *of.mechanics));
+      const VectorXd parameters = parameters_of(group.view(), self.values.parameters);
+      of.mechanics = std::make_unique<MechanicsBatch>(require_mechanics(there, group.view(), group.states(), parameters));
+      of.motion = std::make_unique<NonlinearMotion>(there, group.states(), parameters, *of.mechanics,
+                                                    require_prior_values(there, group.states(), parameters, *of.mechanics));
       of.view = evaluate_view(group.view(), *of.mechanics, group.states());
       linear_.emplace_back().balance = balance_of(*of.mechanics);
     }
@@ -160,7 +159,6 @@ class ExactFit {
 
  private:
   struct OfGroup {
-    VectorXd parameters;
     std::unique_ptr<MechanicsBatch> mechanics;
     std::unique_ptr<NonlinearMotion> motion;
     ViewValues view;
@@ -209,7 +207,6 @@ class FitThroughPoints {
     struct Sum {
       InducingStatistics of_blocks;
       double misfit = 0;
-      MatrixXd memory = {};
       void add(const Sum& other) {
         of_blocks.add(other.of_blocks);
         misfit += other.misfit;
@@ -222,7 +219,7 @@ class FitThroughPoints {
     std::optional<Sum> sum = sum_over_blocks(latents_, BlocksOfStates(prior_, observations_, values_, &about), false, workers_,
                                              nullptr, Sum{InducingStatistics(latents_)},
                                              [&](Sum& of_piece, int, const RowBlock& rows, const InducingBlock& block) {
-                                               of_piece.of_blocks.add(latents_, block, of_piece.memory);
+                                               of_piece.of_blocks.add(latents_, block);
                                                of_piece.misfit += block.misfit(at.m).squaredNorm();
                                                for (const Reduction::Sample& sample : rows.rows.reduction->samples)
                                                  of_piece.misfit += sample.e_out.squaredNorm();

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <optional>
-#include <utility>
 
 #include "gp2/error.hpp"
 #include "inference/nonlinear_motion.hpp"
@@ -62,9 +61,9 @@ MatrixXd balance_of(const MechanicsBatch& mechanics) {
   return balance;
 }
 
-bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,
-                        const std::vector<int>& gradient_parameters, const Linearisation* about,
-                        std::vector<ObservationModel>& models) {
+std::optional<ModelFault> model_observations(const Prior& prior, const std::vector<Observations>& observations,
+                                             const VectorXd& parameters, const std::vector<int>& gradient_parameters,
+                                             const Linearisation* about, std::vector<ObservationModel>& models) {
   models.resize(observations.size());
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
@@ -72,19 +71,21 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
     const Prior& there = prior_of(prior, group.view());
     const VectorXd theta = parameters_of(group.view(), parameters);
     evaluate_mechanics(there, group.view(), group.states(), theta, model.mechanics);
-    if (model.mechanics.fault) return false;
+    if (model.mechanics.fault) return ModelFault{g, *model.mechanics.fault};
     model.values = {evaluate_view(group.view(), model.mechanics, group.states()),
                     evaluate_prior(there, group.states(), theta, model.mechanics)};
-    if (model.values.prior.fault) return false;
+    if (model.values.prior.fault) return ModelFault{g, *model.values.prior.fault};
     const ViewValues unchanged = there.is_nonlinear() ? model.values.view : ViewValues();
     std::optional<NonlinearMotion> nonlinear;
     Linearisation::OfGroup at;
     if (there.is_nonlinear()) {
       nonlinear.emplace(there, group.states(), theta, model.mechanics, model.values.prior);
       at = about != nullptr ? about->groups[g] : nonlinear->without_signals();
-      if (about == nullptr && nonlinear->solve(at)) return false;
+      if (about == nullptr) {
+        if (const auto fault = nonlinear->solve(at)) return ModelFault{g, *fault};
+      }
       nonlinear->linearise(group.view(), at, model.values.view, model.values.prior);
-      if (model.values.prior.fault) return false;
+      if (model.values.prior.fault) return ModelFault{g, *model.values.prior.fault};
     }
     model.derivatives.clear();
     for (int parameter : gradient_parameters) {
@@ -106,26 +107,15 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
     keep_viewed(group.view(), model.values.prior);
     for (ObservationModel::Values& d : model.derivatives) keep_viewed(group.view(), d.prior);
   }
-  return true;
+  return std::nullopt;
 }
 
 std::vector<ObservationModel> require_models(const Prior& prior, const std::vector<Observations>& observations,
                                              const VectorXd& parameters, const Linearisation* about) {
   std::vector<ObservationModel> models;
-  if (model_observations(prior, observations, parameters, {}, about, models)) return models;
-  // the error names the state
-  for (std::size_t g = 0; g < observations.size(); ++g) {
-    const Observations& group = observations[g];
-    const Prior& there = prior_of(prior, group.view());
-    const VectorXd theta = parameters_of(group.view(), parameters);
-    const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), theta);
-    PriorValues values = require_prior_values(there, group.states(), theta, mechanics);
-    if (!there.is_nonlinear()) continue;
-    const NonlinearMotion nonlinear(there, group.states(), theta, mechanics, std::move(values));
-    Linearisation::OfGroup at = about != nullptr ? about->groups[g] : nonlinear.without_signals();
-    std::optional<MechanicsBatch::Fault> fault = about != nullptr ? std::nullopt : nonlinear.solve(at);
-    if (!fault) fault = evaluate_prior(there, group.states(), theta, mechanics, &at.multipliers).fault;
-    if (fault) throw InputError(internal::describe_fault(*there.system, group.states(), *fault));
+  if (const auto found = model_observations(prior, observations, parameters, {}, about, models)) {
+    const Observations& group = observations[found->group];
+    throw InputError(internal::describe_fault(*prior_of(prior, group.view()).system, group.states(), found->fault));
   }
   return models;
 }

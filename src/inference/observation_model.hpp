@@ -1,5 +1,7 @@
 #pragma once
 
+#include <cstddef>
+#include <optional>
 #include <vector>
 
 #include <Eigen/Core>
@@ -32,12 +34,18 @@ Linearisation take(const Linearisation& of, const std::vector<std::vector<int>>&
 /// Of one group, states first … first + n − 1.
 Linearisation::OfGroup slice(const Linearisation::OfGroup& of, Eigen::Index first, Eigen::Index n);
 
+/// The first fault of the mechanics or the prior, and the Observations that has it.
+struct ModelFault {
+  std::size_t group = 0;
+  MechanicsBatch::Fault fault;
+};
+
 /// @param about   where a nonlinear prior is linearised; null: where no latent acts
 /// @param models  receives one per Observations; what it held is memory to be used again
-/// @returns whether neither the mechanics nor the prior have a fault at any state.
-bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const Eigen::VectorXd& parameters,
-                        const std::vector<int>& gradient_parameters, const Linearisation* about,
-                        std::vector<ObservationModel>& models);
+/// @returns nothing where there is no fault at any state.
+std::optional<ModelFault> model_observations(const Prior& prior, const std::vector<Observations>& observations,
+                                             const Eigen::VectorXd& parameters, const std::vector<int>& gradient_parameters,
+                                             const Linearisation* about, std::vector<ObservationModel>& models);
 
 /// The same, where a fault is an error.
 /// @throws InputError as require_mechanics of the prior.

@@ -2,8 +2,6 @@
 
 #include <utility>
 
-#include "inference/posterior_implementation.hpp"
-
 namespace gp2 {
 
 static_assert(std::atomic<unsigned>::is_always_lock_free);

@@ -264,7 +264,7 @@ GramGradient sweep_pairs(const LatentRows& rows, const Ref<const MatrixXd>& P, c
     gradient.latents.push_back({0.5 * of.kernel.colwise().sum().transpose(), of.columns.colwise().sum().transpose(),
                                 std::move(of.V), std::move(of.mean)});
   }
-  if (has_potential(rows)) add_potential_gradients(rows, P, parts, n_threads, gradient, stop);
+  add_potential_gradients(rows, P, parts, n_threads, gradient, stop);
   return gradient;
 }
 

@@ -80,7 +80,11 @@ struct PathwiseSamples::Implementation {
   std::vector<Sample> samples;
 
   /// @throws InputError when there is none.
-  [[nodiscard]] const Sample& at(int sample) const;
+  [[nodiscard]] const Sample& at(int sample) const {
+    const int n = static_cast<int>(samples.size());
+    if (sample < 0 || sample >= n) throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n));
+    return samples[static_cast<std::size_t>(sample)];
+  }
 };
 
 PathwiseSamples::PathwiseSamples(std::shared_ptr<const Implementation> implementation)
@@ -91,12 +95,6 @@ const PathwiseSamples::Implementation& PathwiseSamples::implementation() const {
 }
 
 int PathwiseSamples::n_samples() const { return static_cast<int>(implementation().samples.size()); }
-
-const PathwiseSamples::Implementation::Sample& PathwiseSamples::Implementation::at(int sample) const {
-  const int n = static_cast<int>(samples.size());
-  if (sample < 0 || sample >= n) throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n));
-  return samples[static_cast<std::size_t>(sample)];
-}
 
 const VectorXd& PathwiseSamples::parameters(int sample) const { return implementation().at(sample).posterior->values.parameters; }
 

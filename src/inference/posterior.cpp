@@ -1,6 +1,5 @@
 #include "gp2/posterior.hpp"
 
-#include <algorithm>
 #include <numeric>
 #include <utility>
 

@@ -29,6 +29,11 @@ struct LatentPoints {
   std::vector<Index> first;                // per latent
   Index size = 0;
 
+  /// Where the functions of latent a stand at state i of query q.
+  [[nodiscard]] auto rows(std::size_t a, Index n_functions, std::size_t q, Index i) const {
+    return Eigen::seqN(first[a] + of_state[q][static_cast<std::size_t>(i)], n_functions, features[a].rows());
+  }
+
   // States of equal features share a point: drawn apart, they would agree to the square root of rounding only.
   LatentPoints(const Posterior::Implementation& posterior, const std::vector<Query>& queries) {
     std::map<std::vector<double>, int> known;
@@ -116,13 +121,8 @@ Index view_samples(const Posterior::Implementation& self, const LatentPoints& po
   std::vector<MatrixXd> f(self.C.size());
   for (Index s = 0; s < out.cols(); ++s) {
     for (std::size_t a = 0; a < f.size(); ++a) {
-      const Index n_points = points.features[a].rows();
       f[a].resize(self.C[a].cols(), query.size());
-      for (Index i = 0; i < query.size(); ++i) {
-        for (Index l = 0; l < f[a].rows(); ++l) {
-          f[a](l, i) = samples_of_f(points.first[a] + l * n_points + points.of_state[q][static_cast<std::size_t>(i)], s);
-        }
-      }
+      for (Index i = 0; i < query.size(); ++i) f[a].col(i) = samples_of_f(points.rows(a, f[a].rows(), q, i), s);
     }
     try {
       query.linearise(self, f);
@@ -167,9 +167,7 @@ MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<View
     for (int i = 0; i < static_cast<int>(query.size()); ++i, row += query.n_rows()) {
       MatrixXd a_bar = query.prior.mean.col(i).replicate(1, n_samples);
       for (std::size_t a = 0; a < self.C.size(); ++a) {
-        const auto rows = Eigen::seqN(points.first[a] + points.of_state[q][static_cast<std::size_t>(i)], self.C[a].cols(),
-                                      points.features[a].rows());
-        a_bar += query.prior.E(a, i) * (self.C[a] * MatrixXd(f(rows, Eigen::all)));
+        a_bar += query.prior.E(a, i) * (self.C[a] * MatrixXd(f(points.rows(a, self.C[a].cols(), q, i), Eigen::all)));
       }
       samples.middleRows(row, query.n_rows()) = (query.view.G(i) * a_bar).colwise() + query.view.offset.col(i);
     }

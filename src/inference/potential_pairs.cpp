@@ -1,7 +1,5 @@
 #include "inference/potential_pairs.hpp"
 
-#include <algorithm>
-
 #include "base/parallel.hpp"
 #include "base/simd.hpp"
 #include "prior/gradient_columns.hpp"
@@ -17,20 +15,7 @@ namespace {
 
 constexpr Index block_size = 16;  // samples of one task
 
-int n_tasks(const LatentRows& rows) { return static_cast<int>((rows.n_samples() + block_size - 1) / block_size); }
-
-// work(sample) of each sample of a task
-template <typename Work>
-void for_each_sample(const LatentRows& rows, int task, const std::atomic<bool>* stop, const Work& work) {
-  const Index end = std::min((task + 1) * block_size, rows.n_samples());
-  for (Index j = task * block_size; j < end && !is_set(stop); ++j) work(j);
-}
-
 }  // namespace
-
-bool has_potential(const LatentRows& rows) {
-  return std::any_of(rows.latents.begin(), rows.latents.end(), [](const auto& latent) { return latent.is_potential; });
-}
 
 void add_potentials(const LatentRows& rows, int n_threads, Ref<MatrixXd> K, const std::atomic<bool>* stop) {
   const Reduction& reduction = *rows.reduction;
@@ -39,10 +24,10 @@ void add_potentials(const LatentRows& rows, int n_threads, Ref<MatrixXd> K, cons
     if (!latent.is_potential) continue;
     const GradientColumns columns(latent.kernel);
     const Index m = latent.n_functions, n = rows.n_samples();
-    parallel_for(n_tasks(rows), n_threads, [&](int task, int) {
+    for_each_block(n, block_size, n_threads, [&](Index first_sample, Index n_of_block, int) {
       GradientColumns::Workspace w;
       VectorXd point, loading;
-      for_each_sample(rows, task, stop, [&](Index j) {
+      for (Index j = first_sample; j < first_sample + n_of_block && !is_set(stop); ++j) {
         latent.kernel.scale(j, point);
         columns.evaluate(0, n, point, w);
         for (std::size_t right = 0; right < n_components && j < reduction.count[right]; ++right) {
@@ -58,7 +43,7 @@ void add_potentials(const LatentRows& rows, int n_threads, Ref<MatrixXd> K, cons
             }
           }
         }
-      });
+      }
     });
   }
 }
@@ -89,14 +74,14 @@ void add_potential_gradients(const LatentRows& rows, const Ref<const MatrixXd>& 
     GramGradient::OfLatent& out = gradient.latents[a];
     if (parts[a].V) out.V.setZero(simd::padded(n), latent.Z.cols());
     if (parts[a].mean) out.mean.setZero(simd::padded(n), m);
-    std::vector<TaskSums> sums(static_cast<std::size_t>(n_tasks(rows)),
+    std::vector<TaskSums> sums(static_cast<std::size_t>((n + block_size - 1) / block_size),
                                {VectorXd::Zero(latent.kernel.values().size()), VectorXd::Zero(m)});
-    parallel_for(n_tasks(rows), n_threads, [&](int task, int) {
+    for_each_block(n, block_size, n_threads, [&](Index first_sample, Index n_of_block, int) {
       GradientColumns::Workspace w;
-      TaskSums& sum = sums[static_cast<std::size_t>(task)];
+      TaskSums& sum = sums[static_cast<std::size_t>(first_sample / block_size)];
       VectorXd point, loading, V(m), S(rows.size());
       MatrixXd U(n, m);
-      for_each_sample(rows, task, stop, [&](Index j) {
+      for (Index j = first_sample; j < first_sample + n_of_block && !is_set(stop); ++j) {
         latent.kernel.scale(j, point);
         columns.evaluate(0, n, point, w);
         if (parts[a].mean) {
@@ -123,7 +108,7 @@ void add_potential_gradients(const LatentRows& rows, const Ref<const MatrixXd>& 
           if (parts[a].V) out.V.row(j).segment(c * m, m) = V.transpose();
           if (parts[a].kernel) columns.add_gradient(U, loading, sum.kernel, w);
         }
-      });
+      }
     });
     out.kernel.setZero(parts[a].kernel ? latent.kernel.values().size() : 0);
     out.columns.setZero(m);

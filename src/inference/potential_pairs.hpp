@@ -11,9 +11,6 @@
 // assemble and sweep_pairs have k_ij Z_i Z_jᵀ.
 namespace gp2 {
 
-/// Whether one of them is.
-[[nodiscard]] bool has_potential(const LatentRows& rows);
-
 /// Adds their part of K̃ to the lower triangle.
 /// @param stop  set: leaves out the rest
 void add_potentials(const LatentRows& rows, int n_threads, Eigen::Ref<Eigen::MatrixXd> K, const std::atomic<bool>* stop);

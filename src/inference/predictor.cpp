@@ -4,8 +4,6 @@
 #include <utility>
 #include <vector>
 
-#include <fmt/format.h>
-
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "inference/predictor_component.hpp"

@@ -117,7 +117,7 @@ IndependentColumns independent_columns(MatrixXd X) {
   VectorXd norms(d), reflection(std::min(X.rows(), d));
   for (Index k = 0; k < d; ++k) norms[k] = X.col(k).stableNorm();
   // a column whose square vanishes, alone or beside that of the largest, has no variance, and no other is a multiple of it
-  const double largest = norms.maxCoeff();
+  const double largest = norms.lpNorm<Eigen::Infinity>();
   const double least = std::isfinite(largest) ? smallest * std::max(1.0, largest) : 0;
   for (Index k = 0; k < d; ++k) {
     if (norms[k] <= least) {

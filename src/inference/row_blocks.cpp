@@ -86,7 +86,7 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
       memory.about.groups = {slice(about_->groups[group], first, n)};
       about = &memory.about;
     }
-    if (!model_observations(prior_, memory.observations, values_.parameters, in, about, memory.models)) return nullptr;
+    if (model_observations(prior_, memory.observations, values_.parameters, in, about, memory.models)) return nullptr;
     block.models = &memory.models;
   }
   reduce(prior_, memory.observations, *block.models, {values_.noise_stddev[group]}, memory.reduction);

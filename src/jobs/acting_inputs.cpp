@@ -99,8 +99,7 @@ void clear_unknown(const CommandedRows& commanded, const CsvTable& log, MatrixXd
 }
 
 std::optional<CommandedRows> estimated_at(std::optional<CommandedRows> commanded, const std::vector<int>& rows) {
-  const auto is_estimated = [](const Actuator& actuator) { return actuator.is_estimated(); };
-  if (!commanded || std::ranges::none_of(commanded->actuators, is_estimated)) return std::nullopt;
+  if (!commanded || std::ranges::none_of(commanded->actuators, &Actuator::is_estimated)) return std::nullopt;
   std::vector<CommandRecord::Place> places;
   for (const int row : rows) places.push_back(commanded->places[static_cast<std::size_t>(row)]);
   commanded->places = std::move(places);

@@ -26,6 +26,7 @@
 #include "jobs/repeated_rows.hpp"
 #include "mechanics/in_blocks.hpp"
 #include "mechanics/known_multipliers.hpp"
+#include "prior/code_function.hpp"
 
 namespace gp2 {
 
@@ -80,7 +81,10 @@ void check_marks(const Model& model, std::vector<Finding>& findings) {
     try {
       require_estimable(prior, name);
     } catch (const InputError& error) {
-      findings.push_back({Level::error, error.what()});
+      const bool is_zero = model.system->parameters()[static_cast<std::size_t>(model.system->parameter_index(name))].value == 0;
+      findings.push_back(is_zero
+                             ? Finding{Level::warning, fmt::format("{}; a fit by the default protocol refuses it", error.what())}
+                             : Finding{Level::error, error.what()});
     }
   }
 }
@@ -260,12 +264,10 @@ void check_latents(const Model& model, const Eigen::MatrixXd& states, std::vecto
       is_known = is_known && !(reads[k] && std::isnan(states(static_cast<Eigen::Index>(k), i)));
     if (is_known) rows.push_back(i);
   }
+  const Eigen::MatrixXd known = states(Eigen::all, rows);
+  if (auto mixed = mixed_states_text(prior, known, parameters)) findings.push_back({Level::error, *std::move(mixed)});
   ActingStates acting(prior);
-  if (std::ssize(rows) == states.cols()) {
-    acting.count(prior, states, parameters);
-  } else {
-    acting.count(prior, states(Eigen::all, rows), parameters);
-  }
+  acting.count(prior, known, parameters);
   for (std::string& text : acting.idle_texts()) findings.push_back({Level::warning, std::move(text)});
   if (std::ranges::none_of(prior.latents, [&](const Latent& one) { return LoadCheck::reads_load(one, parameters); })) return;
   const auto stride = std::max<Eigen::Index>(1, std::ssize(rows) / enough);
@@ -415,20 +417,27 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   }
 }
 
-// Whether a constraint of positions that the log obeys counts the turns of coordinate j, as a gear's does: it is linear in it.
+// Whether a constraint of positions that the log obeys counts the turns of coordinate j in rad, as that of a rack and pinion does: it
+// is linear in it, and the log would not obey it with angles of another unit.
 bool counts_turns(const System& system, const Eigen::MatrixXd& states, int j) {
   const auto residuals_after = [&](double radians) {
     Eigen::MatrixXd turned = states;
     turned.row(system.layout().q(j)).array() += radians;
     return system.residuals(turned, system.parameter_values());
   };
+  Eigen::MatrixXd scaled = states;
+  for (int i = 0; i < system.nq(); ++i) {
+    if (system.coordinates()[static_cast<std::size_t>(i)].angle) scaled.row(system.layout().q(i)) *= std::numbers::pi / 180;
+  }
+  const Eigen::MatrixXd of_scaled = system.residuals(scaled, system.parameter_values());
   const Eigen::MatrixXd here = residuals_after(0), once = residuals_after(1) - here, twice = residuals_after(2) - here;
   for (std::size_t k = 0; k < system.residual_labels().size(); ++k) {
     constexpr double rounding = 1e-6;
     const auto c = here.row(static_cast<Eigen::Index>(k)).array(), slope = once.row(static_cast<Eigen::Index>(k)).array();
     const auto bend = twice.row(static_cast<Eigen::Index>(k)).array() - 2 * slope;
     if (system.residual_labels()[k].velocity) continue;
-    if ((bend.abs() < rounding * slope.abs() && c.abs() < slope.abs()).all()) return true;
+    const auto other = of_scaled.row(static_cast<Eigen::Index>(k)).array();
+    if ((bend.abs() < rounding * slope.abs() && c.abs() < slope.abs()).all() && !(other.abs() < slope.abs()).all()) return true;
   }
   return false;
 }

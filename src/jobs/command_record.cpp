@@ -70,9 +70,7 @@ CommandRecord::CommandRecord(const System& system, LogReader& reader, std::vecto
   }
   for (Part& part : parts_) part.commands = commands(Eigen::all, part.rows);
   constexpr double little = 0.01;
-  const MatrixXd sizes = commands.array().isNaN().select(0.0, commands.cwiseAbs());
-  small_ = VectorXd::Zero(sizes.rows());
-  for (Index k = 0; k < sizes.rows() && sizes.cols() > 0; ++k) small_[k] = little * sizes.row(k).maxCoeff();
+  small_ = little * row_size(commands);
 }
 
 std::vector<CommandRecord::Place> CommandRecord::places(LogReader& reader) const {

@@ -38,10 +38,9 @@ struct Misfit {
 
 /// Says so where measured coordinates contradict the constraints among them by more than noise does.
 std::optional<std::string> contradiction_of(const std::vector<Misfit>& of_episodes, const std::vector<std::string>& names) {
-  const auto n_clear = std::count_if(of_episodes.begin(), of_episodes.end(), [](const Misfit& one) { return one.is_clear(); });
+  const auto n_clear = std::ranges::count_if(of_episodes, &Misfit::is_clear);
   if (n_clear == 0) return std::nullopt;
-  const Misfit& worst =
-      *std::max_element(of_episodes.begin(), of_episodes.end(), [](const Misfit& a, const Misfit& b) { return a.size < b.size; });
+  const Misfit& worst = *std::ranges::max_element(of_episodes, {}, &Misfit::size);
   // where all move together some hardly do
   std::vector<std::string> moves;
   for (Index k = 0; k < worst.move.size(); ++k) {

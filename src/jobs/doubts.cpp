@@ -13,6 +13,7 @@
 
 #include "base/not_a_number.hpp"
 #include "data/evenly.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "jobs/rate_check.hpp"
@@ -251,15 +252,14 @@ std::optional<int> lines_apart(const std::vector<std::vector<int>>& lines) {
     if (of_log.size() < 2) continue;
     std::vector<int> steps(of_log.size());
     std::adjacent_difference(of_log.begin(), of_log.end(), steps.begin());
-    const auto middle = steps.begin() + 1 + static_cast<std::ptrdiff_t>(steps.size() - 1) / 2;
-    std::nth_element(steps.begin() + 1, middle, steps.end());
+    const auto middle = static_cast<int>(median({steps.begin() + 1, steps.end()}));
     // some lines may have been left out, but of lines at random none is a number of rows later
     const auto n_steps = std::ssize(steps) - 1;
-    const auto n_equal = std::count(steps.begin() + 1, steps.end(), *middle);
-    const bool are_even = std::all_of(steps.begin() + 1, steps.end(), [&](int step) { return std::abs(step - *middle) <= 1; });
+    const auto n_equal = std::count(steps.begin() + 1, steps.end(), middle);
+    const bool are_even = std::all_of(steps.begin() + 1, steps.end(), [&](int step) { return std::abs(step - middle) <= 1; });
     if (!are_even && n_equal * 10 < n_steps * 9) return std::nullopt;
-    if (apart && *apart != *middle) return std::nullopt;
-    apart = *middle;
+    if (apart && *apart != middle) return std::nullopt;
+    apart = middle;
   }
   return apart.value_or(1);
 }

@@ -788,7 +788,8 @@ FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
                                  side_information->view().quantity->word(), side_information->view().quantity->word()));
   }
   FitJob job = prepare_fit(std::move(request));
-  if (fit.logs.empty()) return job;
+  // arrays alone have no file to compare with
+  if (std::ranges::all_of(fit.logs, [](const LogFile& log) { return log.checksum.empty(); })) return job;
   for (const LogFile& log : job.file.logs) {
     if (fit.has_learned(log)) continue;
     const auto named = std::ranges::find(fit.logs, log.name, &LogFile::name);

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <filesystem>
 #include <fstream>
-#include <sstream>
 
 #include <fmt/format.h>
 
@@ -146,17 +145,9 @@ int side_by_side(const FitProblem& problem, const FitOptions& options) {
 
 double gigabytes(double bytes) { return bytes / 1e9; }
 
-std::optional<std::string> content(const std::filesystem::path& path) {
-  std::ifstream file(path);
-  if (!file) return std::nullopt;
-  std::ostringstream text;
-  text << file.rdbuf();
-  return text.str();
-}
-
 // the number behind a key, or the only one where the key is empty; nothing where there is none, as for "max"
 std::optional<double> number_of(const std::filesystem::path& path, const std::string& key) {
-  std::istringstream words(content(path).value_or(""));
+  std::ifstream words(path);
   std::string word;
   double value = 0;
   while (!key.empty() && words >> word && word != key) continue;
@@ -236,7 +227,7 @@ std::optional<double> free_memory(const std::filesystem::path& root) {
   if (!free) return std::nullopt;
   *free *= 1024;
   // a line per hierarchy, ID:CONTROLLERS:/PATH; the group and all above it have limits
-  std::istringstream groups(content(root / "proc/self/cgroup").value_or(""));
+  std::ifstream groups(root / "proc/self/cgroup");
   for (std::string line; std::getline(groups, line);) {
     const std::size_t first = line.find(':'), second = line.find(':', first + 1);
     if (second == std::string::npos) continue;

@@ -369,11 +369,8 @@ std::ptrdiff_t n_independent(const Posterior& posterior, const Observations& gro
   const auto n_finite = [&](Eigen::Index i) {
     return static_cast<std::ptrdiff_t>(group.values().col(i).array().isFinite().count());
   };
+  if (!group.view().is_of_ddq()) return group.values().array().isFinite().count();
   std::ptrdiff_t n = 0;
-  if (!group.view().is_of_ddq()) {
-    for (Eigen::Index i = 0; i < group.n_data(); ++i) n += n_finite(i);
-    return n;
-  }
   const System& system = prior_of(posterior.prior(), group.view()).reference_system();
   for_each_mechanics(system, group.states(), parameters_of(group.view(), posterior.values().parameters), 1,
                      [&](Eigen::Index first, const MechanicsBatch& mechanics) {

@@ -11,12 +11,14 @@
 #include <fmt/ranges.h>
 
 #include "gp2/error.hpp"
+#include "gp2/mechanics/check.hpp"
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
 #include "jobs/acting_states.hpp"
 #include "jobs/fit_notes.hpp"
 #include "jobs/log_columns.hpp"
 #include "jobs/read_observations.hpp"
+#include "prior/code_function.hpp"
 
 namespace gp2 {
 
@@ -386,6 +388,17 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
   }
 }
 
+// before any number is computed from functions that mix states
+void require_separate_states(const FitProblem& problem) {
+  for (const Observations& group : problem.observations) {
+    const Prior& there = prior_of(problem.prior, group.view());
+    const VectorXd parameters = parameters_of(group.view(), problem.prior.system->parameter_values());
+    auto mixed = mixed_states(*there.system, group.states(), parameters);
+    if (!mixed) mixed = mixed_states_text(there, group.states(), parameters);
+    if (mixed) throw InputError(fmt::format("'{}': {}", there.system->name(), *mixed));
+  }
+}
+
 // Latents that act at none of the states of all logs.
 void note_idle_latents(FitProblem& problem) {
   ActingStates acting(problem.prior);
@@ -721,6 +734,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   }
   add_side_information(model, also, options, estimated, problem);
   add_late(model, options, problem);
+  require_separate_states(problem);
   note_idle_latents(problem);
   if (options.protocol.name == Protocol::Name::standard) centre_features(model, problem);
   if (has_discrepancy(model, problem, options)) add_discrepancy(model, problem);

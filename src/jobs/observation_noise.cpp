@@ -51,10 +51,7 @@ struct NoiseRule {
     if (!((signal / stddev.array()).square().sum() > largest_norm)) return;
     Index worst = 0;
     const double least = stddev.minCoeff(&worst);
-    throw InputError(
-        fmt::format("{}: data row {}: the noise standard deviation {} of {} is too small for double precision beside a spread of "
-                    "{:.3g}; the smallest usable value is {}",
-                    source, rows[static_cast<std::size_t>(worst)] + 1, least, name, signal, rounded_up(smallest())));
+    refuse_too_small(least, fmt::format("data row {}: ", rows[static_cast<std::size_t>(worst)] + 1));
   }
 
   void require(double stddev, bool estimated) const {
@@ -62,15 +59,17 @@ struct NoiseRule {
       throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev));
     }
     if (stddev > largest_number) refuse_too_large(stddev);
-    if (!estimated && stddev < smallest()) {
-      throw InputError(
-          fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
-                      "of {:.3g}; the smallest usable value is {}",
-                      source, stddev, name, signal, rounded_up(smallest())));
-    }
+    if (!estimated && stddev < smallest()) refuse_too_small(stddev);
   }
 
   /// @param place  "data row 3: ", or nothing
+  [[noreturn]] void refuse_too_small(double stddev, const std::string& place = "") const {
+    throw InputError(
+        fmt::format("{}: {}the noise standard deviation {} of {} is too small for double precision beside a spread of {:.3g}; "
+                    "the smallest usable value is {}",
+                    source, place, stddev, name, signal, rounded_up(smallest())));
+  }
+  /// @param place  as above
   [[noreturn]] void refuse_too_large(double stddev, const std::string& place = "") const {
     throw InputError(fmt::format("{}: {}the noise standard deviation {} of {} is too large: at most {:.0e} can be computed with",
                                  source, place, stddev, name, largest_number));
@@ -88,12 +87,6 @@ void require_no_gross_errors(const Eigen::RowVectorXd& values, const std::string
       fmt::format("single values of {} lie far from all others, which spread by {:.3g}, not by {:.3g}: correct or leave out "
                   "impossible ones, such as {:.6g}, or fit with `robust`",
                   name, without, spread, farthest));
-}
-
-std::vector<std::string> stddev_columns(const std::vector<std::string>& names, const LogReader& reader) {
-  std::vector<std::string> columns;
-  for (const std::string& name : names) columns.push_back(reader.stddev_column(name));
-  return columns;
 }
 
 // Standard deviation of each row, over the values that a robust fit does not distrust at sight.
@@ -157,7 +150,8 @@ MatrixXd stated_noise(const Model& model, const std::vector<std::string>& observ
                       LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
   const std::vector<std::string> stated = stated_accelerations(observed, reader);
   if (stated.empty()) return {};
-  const std::vector<std::string> columns = stddev_columns(stated, reader);
+  std::vector<std::string> columns;
+  for (const std::string& name : stated) columns.push_back(reader.stddev_column(name));
   if (options.noise_stddev) {
     notes.push_back(fmt::format("{}: `noise_std={}` replaces the standard deviations in {}", log.name(), *options.noise_stddev,
                                 fmt::join(columns, ", ")));

@@ -41,10 +41,6 @@ Json json_of(const OptionValue& value) {
                     value);
 }
 
-bool is_one_of(const std::vector<std::string>& words, const std::string& word) {
-  return std::find(words.begin(), words.end(), word) != words.end();
-}
-
 // The reverse of json_of; false where the JSON is of another kind.
 bool read_value(const Json& json, const OptionValue& value) {
   return std::visit(Overloaded{
@@ -55,7 +51,7 @@ bool read_value(const Json& json, const OptionValue& value) {
                         },
                         [&](const YesByDefault& one) { return json.is_boolean() && (json.get_to(*one.value), true); },
                         [&](const Choice& one) {
-                          const bool known = json.is_string() && is_one_of(one.words, json.get<std::string>());
+                          const bool known = json.is_string() && std::ranges::count(one.words, json.get<std::string>()) > 0;
                           if (known) one.set(json.get<std::string>());
                           return known;
                         },

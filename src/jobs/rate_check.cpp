@@ -579,11 +579,12 @@ std::optional<std::string> clipped_velocity(const std::string& name, const Ref<c
   const std::optional<PileUp> found = pile_up(velocities);
   if (!found) return std::nullopt;
   double all = 0, clipped = 0, n = 0, n_clipped = 0;
-  for (Index i = 0; i < velocities.size(); ++i) {
-    const double square = accelerations[i] * accelerations[i];
-    if (std::isnan(square)) continue;
+  for (Index i = 0; i + 1 < velocities.size(); ++i) {
+    // products of neighbours, in which noise cancels
+    const double square = accelerations[i] * accelerations[i], product = accelerations[i] * accelerations[i + 1];
+    if (std::isnan(product)) continue;
     all += square, ++n;
-    if (velocities[i] == found->value) clipped += square, ++n_clipped;
+    if (velocities[i] == found->value && velocities[i + 1] == found->value) clipped += product, ++n_clipped;
   }
   if (!(clipped * n > small * small * all * n_clipped)) return std::nullopt;
   return pile_up_text(name, velocities, "a sensor at the end of its range?");

@@ -103,9 +103,7 @@ int leave_out_held(std::vector<Measurement>& samples, bool steady) {
   if (starts.size() < fewest) return 1;
   std::vector<std::size_t> runs;
   for (std::size_t i = 1; i < starts.size(); ++i) runs.push_back(starts[i] - starts[i - 1]);
-  std::vector<std::size_t> sorted = runs;
-  std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2), sorted.end());
-  const std::size_t k = sorted[sorted.size() / 2];
+  const auto k = static_cast<std::size_t>(median({runs.begin(), runs.end()}));
   const auto n_regular = std::ranges::count_if(runs, [&](std::size_t n) { return steady ? n % k == 0 : n <= k + 1; });
   if (k < 2 || static_cast<double>(n_regular) < share * static_cast<double>(runs.size())) return 1;
   std::vector<Measurement> kept;

@@ -168,14 +168,13 @@ bool was_held(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& u, const Eq
   constexpr double large = 1.5, long_step = 1.5;  // times what nine of ten steps are below; times the usual step of time
   const auto first = static_cast<Index>(run.first), end = first + static_cast<Index>(run.n);
   if (first < 1 || end >= u.size()) return false;
-  std::vector<double> steps, times;
+  std::vector<double> steps;
   for (Index i = 1; i < u.size(); ++i) {
     const double step = std::abs(u[i] - u[i - 1]);
     if (step > 0 && i != end) steps.push_back(step);
-    if (t[i] > t[i - 1]) times.push_back(t[i] - t[i - 1]);
   }
-  if (steps.empty() || times.empty()) return false;
-  const double longest = long_step * median(std::move(times));
+  if (steps.empty()) return false;
+  const double longest = long_step * usual_step(t.transpose());
   const auto goes_on = [&](Index i) { return t[i] > t[i - 1] && t[i] - t[i - 1] < longest; };
   std::ranges::sort(steps);
   const double usual = steps[steps.size() * 9 / 10];
@@ -272,10 +271,7 @@ std::string text_of_rest(const Model& model, const VectorXd& parameters, const M
   const SwitchingFunctions surfaces = switching_functions(model, /*of_latents=*/true);
   if (surfaces.size() == 0) return {};
   const StateLayout layout = model.system->layout();
-  VectorXd small = VectorXd::Zero(values.rows());
-  for (Index k = 0; k < values.rows(); ++k) {
-    for (const double value : values.row(k)) small[k] = std::max(small[k], std::isnan(value) ? 0 : std::abs(value) / 4);
-  }
+  const VectorXd small = row_size(values) / 4;
   const auto is_or_unknown = [](double value, double wanted) { return value == wanted || std::isnan(value); };
   const auto rests = [&](Index i) {
     const auto dq = states.col(i).segment(layout.dq(0), layout.nq);

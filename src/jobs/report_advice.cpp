@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/report_job.hpp"
 
 namespace gp2 {
@@ -218,15 +219,17 @@ void residual_advice(const Report& report, std::vector<Advice>& advice) {
   }
 }
 
-// A noise that came with each value is changed in the log, any other by an option, which a baseline does not have.
+// A noise that came with each value is changed in the log, any other by an option, which a baseline and the paper's protocol do not
+// have.
 std::string noise_mend(const Report& report, const char* too) {
-  if (report.fit.prior_options.baseline) return fmt::format("the noise is stated too {}", too);
-  const bool is_stated =
-      std::any_of(report.fit.observations.begin(), report.fit.observations.end(), [](const Observations& group) {
-        bool any = false;
-        for (int k = 0; k < group.view().size(); ++k) any = any || group.states_noise(k);
-        return any;
-      });
+  const FitFile& fit = report.fit;
+  const bool is_paper = !fit.options.empty() && request_of(fit).problem.protocol.name == Protocol::Name::paper;
+  if (fit.prior_options.baseline || is_paper) return fmt::format("the noise is stated too {}", too);
+  const bool is_stated = std::any_of(fit.observations.begin(), fit.observations.end(), [](const Observations& group) {
+    bool any = false;
+    for (int k = 0; k < group.view().size(); ++k) any = any || group.states_noise(k);
+    return any;
+  });
   if (!is_stated) return fmt::format("the noise is too {}: `noise_std=estimate`", too);
   return fmt::format(
       "the standard deviations in the log's columns NAME_std are too {}, and one factor for all does not correct them", too);

@@ -87,10 +87,7 @@ std::vector<Relevance> relevance_of(const Posterior& posterior) {
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
     if (latent.kernel_is_fixed) continue;
-    double largest_signal = 0;
-    for (Index j = 0; j < values.signal_stddev[a].size(); ++j) {
-      largest_signal = std::max(largest_signal, values.signal_stddev[a][j] / scales.signal_stddev[a][j]);
-    }
+    const double largest_signal = values.signal_stddev[a].cwiseQuotient(scales.signal_stddev[a]).maxCoeff();
     for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
       const Kernel::Parameter& parameter = latent.kernel.parameters()[p];
       const bool periodic = parameter.kind == Kernel::ParameterKind::periodic_lengthscale;

@@ -102,14 +102,9 @@ Features features_of(const Model& model, const std::vector<std::string>& asked) 
 
 // divided by their standard deviation; 0 where they do not vary
 MatrixXd standardised(const MatrixXd& values) {
-  const VectorXd mean = values.rowwise().mean(), stddev = row_stddev(values);
-  MatrixXd out = values.colwise() - mean;
-  for (Index d = 0; d < values.rows(); ++d) {
-    // what is left of a constant is rounding
-    const bool varies = stddev[d] > 1e-12 * values.row(d).cwiseAbs().maxCoeff();
-    out.row(d) *= varies ? 1 / stddev[d] : 0;
-  }
-  return out;
+  const VectorXd mean = values.rowwise().mean(), spread = row_spread(values);
+  const VectorXd scale = (spread.array() > 0).select(spread.cwiseInverse(), 0);
+  return scale.asDiagonal() * (values.colwise() - mean);
 }
 
 }  // namespace

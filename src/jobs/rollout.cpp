@@ -14,6 +14,7 @@
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/simulate_job.hpp"
+#include "jobs/shooting_log.hpp"
 
 namespace gp2 {
 
@@ -28,14 +29,10 @@ struct RolloutLimits {
   static constexpr int n_samples = 16;
   // of one motion, by one component of a mixture or by many: a report is to take seconds
   static constexpr int most_steps = 3000, least_steps = 1000;
-  static constexpr double longest_break = 5;  // usual steps, beyond which a log does not go on
-  static constexpr double window = 30;        // of rms displacement / rms velocity: five oscillations of the slowest coordinate
+  static constexpr double window = 30;  // of rms displacement / rms velocity: five oscillations of the slowest coordinate
   // of the measured range: below it is the noise of a start, above it what an eye sees
   static constexpr double visible_share = 0.05;
 };
-
-// States of a motion that goes on: the first row of it, and how many.
-using Part = std::pair<Index, Index>;
 
 // Entries of the state that a motion needs and the data lack.
 std::vector<std::string> missing_entries(const Model& model, const MatrixXd& states) {
@@ -48,28 +45,6 @@ std::vector<std::string> missing_entries(const Model& model, const MatrixXd& sta
     if (is_needed && !states.row(k).allFinite()) missing.push_back(name);
   }
   return missing;
-}
-
-Part longest_part(const Eigen::Ref<const VectorXd>& times, const std::vector<std::string>& episodes) {
-  const double usual = usual_step(times);
-  Part longest{0, 0}, current{0, 1};
-  const auto end = [&](Index next) {
-    if (current.second > longest.second) longest = current;
-    current = {next, 1};
-  };
-  for (Index i = 1; i < times.size(); ++i) {
-    const double step = times[i] - times[i - 1];
-    const auto k = static_cast<std::size_t>(i);
-    const bool goes_on =
-        step > 0 && step < RolloutLimits::longest_break * usual && (episodes.empty() || episodes[k] == episodes[k - 1]);
-    if (goes_on) {
-      ++current.second;
-    } else {
-      end(i);
-    }
-  }
-  end(times.size());
-  return longest;
 }
 
 // How much of a part is simulated: errors of a start grow, and of more oscillations a picture shows nothing.
@@ -159,13 +134,16 @@ class Roll {
       out.reason = fmt::format("the data lack {}", fmt::join(missing, ", "));
       return;
     }
-    const Part part = longest_part(states.row(layout.t()).transpose(), episodes);
-    if (part.second < RolloutLimits::least_rows) {
+    const std::vector<UnbrokenRows> parts = unbroken_parts(states.row(layout.t()).transpose(), [&](Index i) {
+      return episodes.empty() || episodes[static_cast<std::size_t>(i)] == episodes[static_cast<std::size_t>(i - 1)];
+    });
+    const auto longest = std::ranges::max_element(parts, {}, &UnbrokenRows::n);
+    if (longest == parts.end() || longest->n < RolloutLimits::least_rows) {
       out.reason = fmt::format("the rows are no motion: no {} of them follow each other in time without a break",
                                RolloutLimits::least_rows);
       return;
     }
-    const MatrixXd whole = states.middleCols(part.first, part.second);
+    const MatrixXd whole = states.middleCols(longest->first, longest->n);
     const MatrixXd followed = whole.leftCols(rows_to_follow(system_, whole));
     const Index stride = (followed.cols() + RolloutLimits::most_rows - 1) / RolloutLimits::most_rows;
     const MatrixXd measured = followed(Eigen::all, Eigen::seqN(0, (followed.cols() - 1) / stride + 1, stride));

@@ -64,26 +64,6 @@ void read_columns(const Model& model, const CsvTable& table, const std::map<std:
   }
 }
 
-// Rows over which the log goes on without a break.
-struct UnbrokenRows {
-  Index first = 0, n = 0;
-};
-
-std::vector<UnbrokenRows> unbroken_parts(const CsvTable& table, const VectorXd& times, double usual) {
-  constexpr double most_steps = 5;  // usual ones, beyond which the log does not go on
-  const int episode = table.find("episode");
-  std::vector<UnbrokenRows> parts;
-  for (Index i = 0; i < times.size(); ++i) {
-    const double step = i == 0 ? 0 : times[i] - times[i - 1];
-    const bool goes_on =
-        step > 0 && step < most_steps * usual &&
-        (episode < 0 || table.cell(static_cast<int>(i), episode) == table.cell(static_cast<int>(i - 1), episode));
-    if (!goes_on) parts.push_back({i, 0});
-    ++parts.back().n;
-  }
-  return parts;
-}
-
 // 2/ω of the middle coordinate, the best of 1, 2, 4 on simulated logs: rms of its velocity over that of its changes in velocity.
 double usual_duration(const ShootingLog& log, const StateLayout& layout, const std::vector<UnbrokenRows>& parts) {
   const auto times = log.states.row(layout.t());
@@ -132,7 +112,10 @@ void cut(const Model& model, const CsvTable& table, const ShootRequest& request,
   const double usual = usual_step(times);
   if (usual == 0) throw InputError(fmt::format("{}: t never increases from one row to the next", table.name()));
   const std::vector<bool> can_start = possible_starts(model, log.states);
-  const std::vector<UnbrokenRows> parts = unbroken_parts(table, times, usual);
+  const int episode = table.find("episode");
+  const std::vector<UnbrokenRows> parts = unbroken_parts(times, [&](Index i) {
+    return episode < 0 || table.cell(static_cast<int>(i), episode) == table.cell(static_cast<int>(i - 1), episode);
+  });
   const Index longest = std::ranges::max(parts, {}, &UnbrokenRows::n).n;
   const auto most_rows = static_cast<double>(std::max(longest / 2, least_rows_of_stretch));
   log.duration = request.duration.value_or(
@@ -162,6 +145,19 @@ void cut(const Model& model, const CsvTable& table, const ShootRequest& request,
 }
 
 }  // namespace
+
+std::vector<UnbrokenRows> unbroken_parts(const Eigen::Ref<const VectorXd>& times,
+                                         const std::function<bool(Index i)>& is_same_episode) {
+  constexpr double most_steps = 5;  // usual ones, beyond which a log does not go on
+  const double usual = usual_step(times);
+  std::vector<UnbrokenRows> parts;
+  for (Index i = 0; i < times.size(); ++i) {
+    const double step = i == 0 ? 0 : times[i] - times[i - 1];
+    if (!(step > 0 && step < most_steps * usual && is_same_episode(i))) parts.push_back({i, 0});
+    ++parts.back().n;
+  }
+  return parts;
+}
 
 ShootingLog read_shooting_log(const Model& model, const CsvTable& table, const ShootRequest& request,
                               std::vector<std::string>& notes) {

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <string>
 #include <vector>
 
@@ -8,6 +9,15 @@
 #include "gp2/jobs/shoot_job.hpp"
 
 namespace gp2 {
+
+/// Rows over which a log goes on without a break.
+struct UnbrokenRows {
+  Eigen::Index first = 0, n = 0;
+};
+/// All of them, in their order.
+/// @param is_same_episode  of row i and the one before
+std::vector<UnbrokenRows> unbroken_parts(const Eigen::Ref<const Eigen::VectorXd>& times,
+                                         const std::function<bool(Eigen::Index i)>& is_same_episode);
 
 /// Rows of a log that follow one another, and where the motion over them starts.
 struct Stretch {

@@ -303,15 +303,21 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
 
 namespace {
 
+/// What a component of a posterior, or a sample, says of energies.
+struct LearnedEnergy {
+  VectorXd parameters;
+  std::function<Posterior::Potential(int latent, const MatrixXd& states)> potential;  // against the first state
+};
+
 /// T22 with what each of the latents numbered adds to V. The known potential acts beside it only where the prior's mean has its force.
-MotionEnergy energy_with_learned(const Model& model, const VectorXd& parameters, Prior::Mean mean,
-                                 const std::vector<int>& latents, const MatrixXd& states,
-                                 const std::function<Posterior::Potential(int latent)>& learned) {
+MotionEnergy energy_with_learned(const Model& model, const LearnedEnergy& learned, Prior::Mean mean,
+                                 const std::vector<int>& latents, const MatrixXd& states) {
   MotionEnergy out;
   const bool is_known = model.potential && (latents.empty() || mean == Prior::Mean::force);
-  out.values = is_known ? mechanical_energy(model, parameters, states) : kinetic_energy(*model.system, parameters, states);
+  out.values =
+      is_known ? mechanical_energy(model, learned.parameters, states) : kinetic_energy(*model.system, learned.parameters, states);
   for (const int latent : latents) {
-    const Posterior::Potential V = learned(latent);
+    const Posterior::Potential V = learned.potential(latent, states);
     out.values += V.mean;
     if (latents.size() == 1) out.stddev = V.stddev;
   }
@@ -352,10 +358,9 @@ MotionEnergy mixed(const std::vector<MotionEnergy>& components) {
 
 SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request) {
   const Model& model = *system.model;
-  const auto parameters_of = [&](const VectorXd& fitted) -> VectorXd {
-    return system.other_system ? system.other_system->parameters(fitted) : fitted;
-  };
-  const VectorXd likeliest = parameters_of(posterior.values().parameters);
+  View ddq = View::constrained_acceleration(*model.system), multipliers = View::multipliers(*model.system);
+  ddq.other_system = multipliers.other_system = system.other_system;
+  const VectorXd likeliest = parameters_of(ddq, posterior.values().parameters);
   SimulateJob job = prepare(model, system.actuators, likeliest, request);
   job.notes.insert(job.notes.begin(), system.notes.begin(), system.notes.end());
   job.options.switching = switching_functions(model, /*of_latents=*/true);
@@ -372,58 +377,46 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
                     model.name));
   }
   const bool has_energy = potentials.empty() ? model.potential.has_value() : system.other_system == nullptr && !lacks_potential;
-  const auto energy_under = [&model, mean = posterior.prior().mean, potentials](const VectorXd& parameters,
-                                                                                const MatrixXd& states, const auto& learned) {
-    return energy_with_learned(model, parameters, mean, potentials, states, [&](int a) { return learned(a, states); });
-  };
-  const auto add = [&](const VectorXd& parameters, const auto& function, const auto& energy) {
-    const auto at_system = [&](View view) {
-      view.other_system = system.other_system;
-      return view;
+  const auto add = [&](const VectorXd& parameters, const auto& function, std::vector<LearnedEnergy> energies) {
+    const auto of_view = [&](const View& view) -> Acceleration {
+      return [function, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view, x).col(0); };
     };
-    const auto of_view = [&](View view) -> Acceleration {
-      return [function, view = at_system(view)](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
-        return function(view, x).col(0);
-      };
-    };
-    const View ddq = View::constrained_acceleration(*model.system);
     SimulateJob::Motion motion{parameters, of_view(ddq)};
     motion.contacts = contacts_of(model, parameters);
-    motion.pushed = pushed_acceleration(posterior.prior(), at_system(ddq), function);
+    motion.pushed = pushed_acceleration(posterior.prior(), ddq, function);
     // a baseline knows no constraints
-    if (model.system->nc() > 0 && !posterior.prior().reference) motion.multipliers = of_view(View::multipliers(*model.system));
-    if (has_energy) motion.energy = energy;
+    if (model.system->nc() > 0 && !posterior.prior().reference) motion.multipliers = of_view(multipliers);
+    if (has_energy) {
+      motion.energy = [&model, mean = posterior.prior().mean, potentials,
+                       energies = std::move(energies)](const MatrixXd& states) {
+        std::vector<MotionEnergy> all;
+        for (const LearnedEnergy& one : energies) all.push_back(energy_with_learned(model, one, mean, potentials, states));
+        return mixed(all);
+      };
+    }
     job.motions.push_back(std::move(motion));
   };
   if (!request.n_samples) {
-    std::vector<std::pair<VectorXd, Posterior>> components;
+    std::vector<LearnedEnergy> components;
     for (int k = 0; k < posterior.n_components(); ++k) {
       const Posterior component = posterior.component(k);
-      components.emplace_back(parameters_of(component.values().parameters), component);
+      components.push_back({parameters_of(ddq, component.values().parameters),
+                            [component](int a, const MatrixXd& at) { return component.potential(a, at, at.col(0)); }});
     }
     add(
         likeliest, [posterior](const View& view, const Eigen::Ref<const MatrixXd>& x) { return posterior.mean(view, x); },
-        [energy_under, components](const MatrixXd& states) {
-          std::vector<MotionEnergy> energies;
-          for (const auto& component : components) {
-            const auto learned = [&](int a, const MatrixXd& at) { return component.second.potential(a, at, at.col(0)); };
-            energies.push_back(energy_under(component.first, states, learned));
-          }
-          return mixed(energies);
-        });
+        std::move(components));
     return job;
   }
   const auto samples =
       std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
   for (int k = 0; k < samples->n_samples(); ++k) {
-    const VectorXd parameters = parameters_of(samples->parameters(k));
-    add(
-        parameters, [samples, k](const View& view, const Eigen::Ref<const MatrixXd>& x) { return samples->evaluate(k, view, x); },
-        [energy_under, parameters, samples, k](const MatrixXd& states) {
-          return energy_under(parameters, states, [&](int a, const MatrixXd& at) {
-            return Posterior::Potential{samples->potential(k, a, at, at.col(0)), {}};
-          });
-        });
+    const VectorXd parameters = parameters_of(ddq, samples->parameters(k));
+    const auto potential = [samples, k](int a, const MatrixXd& at) -> Posterior::Potential {
+      return {samples->potential(k, a, at, at.col(0)), {}};
+    };
+    add(parameters, [samples, k](const View& view, const Eigen::Ref<const MatrixXd>& x) { return samples->evaluate(k, view, x); },
+        {{parameters, potential}});
   }
   return job;
 }

@@ -15,6 +15,7 @@
 #include <Eigen/Cholesky>
 
 #include "base/decompositions.hpp"
+#include "base/mixed_states.hpp"
 #include "base/parallel.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
@@ -437,7 +438,17 @@ struct ErrorOfRate {
   std::string constraint;
 };
 
-// A ddq − b against the second difference of each constraint along q(t + h) = q + h dq + ½h² ddq
+// q(t + h) = q + h dq + ½h² ddq of every state, by its own step
+MatrixXd moved(const StateLayout& layout, MatrixXd states, const MatrixXd& ddq, const Eigen::ArrayXd& steps) {
+  const Eigen::DiagonalMatrix<double, Eigen::Dynamic> h(steps.matrix());
+  auto dq = states.middleRows(layout.dq(0), layout.nq);
+  states.middleRows(layout.q(0), layout.nq) += (dq + 0.5 * ddq * h) * h;
+  dq += ddq * h;
+  states.row(layout.t()) += steps.matrix().transpose();
+  return states;
+}
+
+// A ddq − b against the second difference of each constraint along that motion
 ErrorOfRate error_of_rates(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                            int n_threads, double h) {
   const auto n_residuals = std::ssize(system.residual_labels());
@@ -456,18 +467,7 @@ ErrorOfRate error_of_rates(const System& system, const Ref<const MatrixXd>& stat
       const double step = std::max({h, std::min(4 * h, 1e3 * rounding), 4 * rounding});
       return std::isfinite(t) ? (t + step) - t : h;
     });
-    const auto moved_by = [&](const Eigen::ArrayXd& step) {
-      MatrixXd x = block;
-      for (Index i = 0; i < x.cols(); ++i) {
-        for (int j = 0; j < layout.nq; ++j) {
-          x(layout.q(j), i) += step[i] * block(layout.dq(j), i) + 0.5 * step[i] * step[i] * ddq(j, i);
-          x(layout.dq(j), i) += step[i] * ddq(j, i);
-        }
-        x(layout.t(), i) += step[i];
-      }
-      return x;
-    };
-    const MatrixXd after = moved_by(steps), before = moved_by(-steps);
+    const MatrixXd after = moved(layout, block, ddq, steps), before = moved(layout, block, ddq, -steps);
     const MatrixXd now = system.residuals(block, parameters);
     const MatrixXd difference =
         (system.residuals(after, parameters) - system.residuals(before, parameters)) * (0.5 / steps).matrix().asDiagonal();
@@ -549,30 +549,6 @@ std::vector<MatrixXd> evaluate_part(const System& system, SystemPart part, const
   return {values.mass, values.constraint_matrix, values.constraint_vector};
 }
 
-// Functions of all states at once must give each its own values: not one array for all, nor those of its neighbours.
-void check_states_apart(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                        std::vector<Finding>& findings) {
-  if (has_expressions(system) || states.cols() < 2) return;
-  for (const auto& [part, text] : {std::pair(SystemPart::mechanics, "M, A or b"), std::pair(SystemPart::force, "F"),
-                                   std::pair(SystemPart::residuals, "the residuals")}) {
-    const std::vector<MatrixXd> together = evaluate_part(system, part, states, parameters);
-    for (const Index i : {Index{0}, states.cols() / 2, states.cols() - 1}) {
-      const std::vector<MatrixXd> alone = evaluate_part(system, part, states.col(i), parameters);
-      bool differs = false;
-      for (std::size_t k = 0; k < alone.size(); ++k) {
-        const auto a = alone[k].col(0).array(), b = together[k].col(i).array();
-        const double size = alone[k].size() == 0 ? 0 : a.isFinite().select(a.abs(), 0).maxCoeff();
-        differs = differs || !(a == b || (a - b).abs() <= 1e-9 * size || (a.isNaN() && b.isNaN())).all();
-      }
-      if (!differs) continue;
-      findings.push_back({Level::error, fmt::format("{} of state {} differ when it is asked alone: the function mixes rows, or "
-                                                    "returns the same array each time (copy it)",
-                                                    text, i + 1)});
-      break;
-    }
-  }
-}
-
 // Functions declare what they read; what they read besides has no derivative in the state. Expressions show it themselves.
 void check_reads(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                  std::vector<Finding>& findings) {
@@ -627,6 +603,20 @@ void check_reads(const System& system, const Ref<const MatrixXd>& states, const 
 
 }  // namespace
 
+std::optional<std::string> mixed_states(const System& system, const Ref<const MatrixXd>& states,
+                                        const Ref<const VectorXd>& parameters) {
+  if (has_expressions(system) || states.cols() == 0) return std::nullopt;
+  const auto motion = states.topRows(system.layout().t()).array();  // q, dq
+  const double size = motion.isFinite().select(motion.abs(), 0).maxCoeff();
+  for (const auto& [part, what, terms] : {std::tuple(SystemPart::mechanics, "M, A or b", std::vector<double>{0, 0, size}),
+                                          std::tuple(SystemPart::force, "F", std::vector<double>{size}),
+                                          std::tuple(SystemPart::residuals, "the residuals", std::vector<double>{size})}) {
+    const auto evaluate = [&, part = part](const MatrixXd& some) { return evaluate_part(system, part, some, parameters); };
+    if (auto text = mixed_states_text(what, evaluate, states, terms)) return text;
+  }
+  return std::nullopt;
+}
+
 std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                   int n_threads) {
   system.require_states(states);
@@ -636,7 +626,7 @@ std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd
   if (!check_mechanics(system, states, parameters, n_threads, findings)) return findings;
   check_parameter_derivatives(system, states, parameters, n_threads, findings);
   check_motion(system, states, parameters, n_threads, findings);
-  check_states_apart(system, states, parameters, findings);
+  if (auto mixed = mixed_states(system, states, parameters)) findings.push_back({Level::error, *std::move(mixed)});
   check_reads(system, states, parameters, findings);
   return findings;
 }

@@ -29,7 +29,7 @@ void ModelReader::declare(const std::string& name, const TomlValue& at) {
 
 const char* ModelReader::way_to_rename() const {
   return model.robot && !file.has("coordinates")
-             ? R"(, for a joint by coordinates = ["q1", …], one per joint in the order of the file)"
+             ? R"(, for a joint by coordinates = ["q1", …], one per coordinate, in the order of the file)"
              : "";
 }
 

@@ -36,10 +36,11 @@ void declare_coordinate(ModelReader& reader, const Coordinate& coordinate, const
 void take_coordinates_of_robot(ModelReader& reader, const TomlValue& robot) {
   for (const std::string& coordinate : reader.model.robot->coordinates()) {
     if (!is_identifier(coordinate)) {
-      robot.fail(fmt::format(
-          "its joint '{}' has a name that cannot stand in an expression: give names of your own, one per joint in the order of "
-          "the file, with coordinates = [\"q1\", …]",
-          coordinate));
+      robot.fail(
+          fmt::format("its joint '{}' has a name that cannot stand in an expression: give names of your own, one per coordinate, "
+                      "in the order "
+                      "of the file, with coordinates = [\"q1\", …]",
+                      coordinate));
     }
     declare_coordinate(reader, {coordinate, false}, robot);
   }
@@ -137,10 +138,13 @@ void refuse_names_of_other_columns(const ModelReader& reader) {
   std::ranges::move(system.acceleration_names(), std::back_inserter(names));
   const auto forbid = [&](const std::string& column, const std::string& of) {
     if (std::ranges::count(names, column) == 0) return;
-    reader.file.fail_at(1, reader.file.has("coordinates") ? "coordinates" : "robot",
+    const bool is_input = std::ranges::count(system.inputs(), column) > 0;
+    const char* const key = is_input ? "inputs" : reader.file.has("coordinates") ? "coordinates" : "robot";
+    const auto at = reader.file.get(key);
+    reader.file.fail_at(at ? at->line() : 1, key,
                         fmt::format("the column {} would be a name of this model and what logs and predictions call a quantity "
                                     "of {}; choose another name{}",
-                                    column, of, reader.way_to_rename()));
+                                    column, of, is_input ? "" : reader.way_to_rename()));
   };
   for (const Coordinate& coordinate : system.coordinates()) {
     const std::string of = fmt::format("'{}'", coordinate.name);

@@ -15,14 +15,19 @@ void read_columns(ModelReader& reader, const TomlValue& columns) {
   std::set<std::string> known, taken;
   for (Expression symbol : reader.symbols->state()) known.insert(symbol.variable_name());
   for (Expression symbol : reader.symbols->ddq) known.insert(symbol.variable_name());
+  const auto is_coordinate = [&](const std::string& name) {
+    return std::ranges::count(reader.definition.coordinates, name, &Coordinate::name) > 0;
+  };
   for (const auto& [name, entry] : columns.entries()) {
     if (!known.contains(name)) entry.fail("not a coordinate, velocity, acceleration, input or t of this model");
     const std::string column = entry.text();
     if (column != name && known.contains(column)) {
-      entry.fail(
-          fmt::format("the column '{0}' has the name of another quantity of this model, and in files that gp2 writes it is that "
-                      "quantity: leave this out, and read logs that are like this with `map={0}={1}`",
-                      column, name));
+      // columns of one kind can be exchanged; others have rates of their own
+      const bool is_exchange = is_coordinate(name) && is_coordinate(column);
+      entry.fail(fmt::format(
+          "the column '{}' has the name of another quantity of this model, and in files that gp2 writes it is "
+          "that quantity: leave this out{}",
+          column, is_exchange ? fmt::format(", and read logs that are like this with `map={0}={1},{1}={0}`", column, name) : ""));
     }
     if (!taken.insert(column).second) entry.fail(fmt::format("the column '{}' is another name's already", column));
     reader.model.columns[name] = column;

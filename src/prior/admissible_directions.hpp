@@ -1,7 +1,6 @@
 #pragma once
 
 #include <limits>
-#include <utility>
 
 #include <fmt/format.h>
 #include <Eigen/Core>

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include "base/mixed_states.hpp"
 #include "gp2/error.hpp"
 #include "mechanics/differences.hpp"
 
@@ -51,6 +52,24 @@ MatrixXd CodeFunction::differentiate(const States& states, const Parameters& par
     sum += weight * evaluate(states, moved);
   }
   return checked(std::move(sum), "the difference of evaluate", states, true);
+}
+
+std::optional<std::string> CodeFunction::mixed_states_text(const States& states, const Parameters& parameters) const {
+  return gp2::mixed_states_text(
+      what_, [&](const MatrixXd& some) { return std::vector<MatrixXd>{evaluate(some, parameters)}; }, states);
+}
+
+std::optional<std::string> mixed_states_text(const Prior& prior, const StateFunction::States& states,
+                                             const StateFunction::Parameters& parameters) {
+  for (const Latent& latent : prior.latents) {
+    const auto* const features = dynamic_cast<const CodeFunction*>(latent.features.get());
+    const auto* const directions = dynamic_cast<const CodeFunction*>(latent.directions.get());
+    std::optional<std::string> text;
+    if (features != nullptr) text = features->mixed_states_text(states, VectorXd());
+    if (!text && directions != nullptr) text = directions->mixed_states_text(states, parameters);
+    if (text) return text;
+  }
+  return std::nullopt;
 }
 
 class CodeFunction::DifferenceEvaluator final : public Evaluator {

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -21,6 +22,8 @@ class CodeFunction final : public StateFunction {
   [[nodiscard]] Eigen::MatrixXd evaluate(const States& states, const Parameters& parameters) const override;
   [[nodiscard]] Eigen::MatrixXd differentiate(const States& states, const Parameters& parameters, int index) const override;
   [[nodiscard]] bool reads(int state_index) const override { return reads_[static_cast<std::size_t>(state_index)]; }
+  /// Whether what it gives a state depends on the others, as a text; nothing if not.
+  [[nodiscard]] std::optional<std::string> mixed_states_text(const States& states, const Parameters& parameters) const;
   [[nodiscard]] std::unique_ptr<Evaluator> make_evaluator(const Parameters& parameters) const override;
 
  private:
@@ -33,5 +36,9 @@ class CodeFunction final : public StateFunction {
   std::shared_ptr<const System> system_;
   std::vector<bool> reads_;
 };
+
+/// The same of the latents' features and directions, as far as they are code.
+std::optional<std::string> mixed_states_text(const Prior& prior, const StateFunction::States& states,
+                                             const StateFunction::Parameters& parameters);
 
 }  // namespace gp2

@@ -8,7 +8,6 @@
 namespace gp2 {
 
 using Eigen::Index;
-using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 using Primitive = Kernel::Primitive;

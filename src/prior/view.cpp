@@ -238,43 +238,6 @@ MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Ref
 
 namespace {
 
-StateMechanics mechanics_at(const View& view, const MechanicsBatch& mechanics, int i) {
-  return {mechanics.projections[static_cast<std::size_t>(i)], mechanics.values.A(i), view.required_time_step()};
-}
-
-// Columns of N, or their derivatives, at every state.
-class Slip {
- public:
-  Slip(const View& view, const MechanicsBatch& mechanics) : view_(view), mechanics_(mechanics) {
-    for (Index row = 0; row < mechanics.constraint_noise.size() && !view.latent; ++row) {
-      if (mechanics.constraint_noise[row] > 0) soft_.push_back(row);
-    }
-  }
-
-  /// @param column  writes d, or its derivative, of one motion, all rows, to a (size × 1) matrix, given its projection
-  template <typename Column>
-  [[nodiscard]] MatrixXd collect(Index n_rows, const Column& column) const {
-    const Index n_states = mechanics_.values.n_states();
-    MatrixXd out(view_.size() * std::ssize(soft_), n_states);
-    MatrixXd all(n_rows, 1);
-    UdwadiaKalaba unit;
-    for (int i = 0; i < n_states; ++i) {
-      for (std::size_t k = 0; k < soft_.size(); ++k) {
-        unit.compute(mechanics_.values.M(i), mechanics_.values.A(i),
-                     mechanics_.constraint_noise[soft_[k]] * VectorXd::Unit(mechanics_.constraint_noise.size(), soft_[k]));
-        column(i, unit, all);
-        out.col(i).segment(static_cast<Index>(k) * view_.size(), view_.size()) = all(view_.rows, 0);
-      }
-    }
-    return out;
-  }
-
- private:
-  const View& view_;
-  const MechanicsBatch& mechanics_;
-  std::vector<Index> soft_;
-};
-
 // ∂A/∂p, for any number of motions
 class ParameterChange final : public ConstraintChange {
  public:
@@ -288,33 +251,37 @@ class ParameterChange final : public ConstraintChange {
   SystemValues::ConstBlock dA_;
 };
 
-// Every row of G and d of a quantity at one state, or their derivatives.
-struct Affine {
-  MatrixXd G;
-  MatrixXd d;  // (size × 1)
-};
-
-// the rows of the view at every state, at(i, all rows)
-template <typename At>
-ViewValues collect(const View& view, const MechanicsBatch& mechanics, const At& at) {
-  const Index nq = mechanics.values.force.rows();
-  const int n_states = mechanics.values.n_states();
-  ViewValues out{MatrixXd(view.size() * nq, n_states), MatrixXd(view.size(), n_states), {}};
+// The rows of the view at every state, and the columns of N.
+// @param write  write(i, projection, G, d) writes every row of G and d (× 1) of a motion, or of their derivatives; where G is null d
+//               alone, of what noise of deviation 1 makes of one constraint: db is no part of it
+template <typename Write>
+ViewValues collect(const View& view, const MechanicsBatch& mechanics, const Write& write) {
+  const auto nq = static_cast<int>(mechanics.values.force.rows()),
+             nc = static_cast<int>(mechanics.values.constraint_vector.rows());
+  require_rows(view, nq, nc);
+  std::vector<Index> soft;
+  for (Index row = 0; row < mechanics.constraint_noise.size() && !view.latent; ++row) {
+    if (mechanics.constraint_noise[row] > 0) soft.push_back(row);
+  }
+  const int n_rows = view.quantity->n_rows(nq, nc), n_states = mechanics.values.n_states();
+  ViewValues out{MatrixXd(view.size() * nq, n_states), MatrixXd(view.size(), n_states),
+                 MatrixXd(view.size() * std::ssize(soft), n_states)};
+  MatrixXd G(n_rows, nq), d(n_rows, 1);
+  UdwadiaKalaba unit;
   for (int i = 0; i < n_states; ++i) {
-    const Affine& affine = at(i);
-    Eigen::Map<MatrixXd>(out.matrix.col(i).data(), view.size(), nq) = affine.G(view.rows, Eigen::all);
-    out.offset.col(i) = affine.d(view.rows, 0);
+    write(i, mechanics.projections[static_cast<std::size_t>(i)], &G, d);
+    Eigen::Map<MatrixXd>(out.matrix.col(i).data(), view.size(), nq) = G(view.rows, Eigen::all);
+    out.offset.col(i) = d(view.rows, 0);
+    for (std::size_t k = 0; k < soft.size(); ++k) {
+      unit.compute(mechanics.values.M(i), mechanics.values.A(i),
+                   mechanics.constraint_noise[soft[k]] * VectorXd::Unit(nc, soft[k]));
+      write(i, unit, nullptr, d);
+      out.slip.col(i).segment(static_cast<Index>(k) * view.size(), view.size()) = d(view.rows, 0);
+    }
   }
   // what a latent adds has no part of the offset
   if (view.latent) out.offset.setZero();
   return out;
-}
-
-Affine affine_of(const View& view, const SystemValues& values) {
-  const auto nq = static_cast<int>(values.force.rows()), nc = static_cast<int>(values.constraint_vector.rows());
-  require_rows(view, nq, nc);
-  const int n_rows = view.quantity->n_rows(nq, nc);
-  return {MatrixXd(n_rows, nq), MatrixXd(n_rows, 1)};
 }
 
 }  // namespace
@@ -322,49 +289,34 @@ Affine affine_of(const View& view, const SystemValues& values) {
 ViewValues evaluate_view(const View& view, const MechanicsBatch& mechanics, const Ref<const MatrixXd>& states) {
   QuantityKind::Workspace workspace;
   AffineMotion motion;
-  Affine all = affine_of(view, mechanics.values);
-  ViewValues out = collect(view, mechanics, [&](int i) -> const Affine& {
-    const StateMechanics at = mechanics_at(view, mechanics, i);
-    motion.evaluate(at.projection, mechanics.values.M(i), view.quantity->parts());
-    view.quantity->evaluate(at, motion.linear(), all.G, workspace);
-    view.quantity->evaluate(at, motion.constant(), all.d, workspace);
-    return all;
+  ViewValues out = collect(view, mechanics, [&](int i, const UdwadiaKalaba& projection, MatrixXd* G, MatrixXd& d) {
+    const StateMechanics at{projection, mechanics.values.A(i), view.required_time_step()};
+    motion.evaluate(projection, mechanics.values.M(i), view.quantity->parts());
+    if (G != nullptr) view.quantity->evaluate(at, motion.linear(), *G, workspace);
+    view.quantity->evaluate(at, motion.constant(), d, workspace);
   });
   const StateLayout layout{static_cast<int>(mechanics.values.force.rows()), 0};
   for (int k = 0; k < view.size(); ++k) {
     if (const std::optional<int> entry = view.added_entry(layout, k)) out.offset.row(k) += states.row(*entry);
   }
-  out.slip = Slip(view, mechanics).collect(all.d.rows(), [&](int i, const UdwadiaKalaba& unit, MatrixXd& d) {
-    motion.evaluate(unit, mechanics.values.M(i), view.quantity->parts());
-    view.quantity->evaluate({unit, mechanics.values.A(i), view.required_time_step()}, motion.constant(), d, workspace);
-  });
   return out;
 }
 
 ViewValues differentiate_view(const View& view, const MechanicsBatch& mechanics, const SystemValues& derivative) {
   QuantityKind::Workspace workspace;
   AffineMotion motion, dmotion;
-  Affine all = affine_of(view, mechanics.values);
-  ViewValues out = collect(view, mechanics, [&](int i) -> const Affine& {
-    const StateMechanics at = mechanics_at(view, mechanics, i);
+  return collect(view, mechanics, [&](int i, const UdwadiaKalaba& projection, MatrixXd* G, MatrixXd& d) {
+    const StateMechanics at{projection, mechanics.values.A(i), view.required_time_step()};
+    if (G != nullptr) view.quantity->require_parameter_derivatives(at);
     const auto M = mechanics.values.M(i);
     const ParameterChange dA(derivative.A(i));
-    view.quantity->require_parameter_derivatives(at);
-    motion.evaluate(at.projection, M, view.quantity->parts());
-    dmotion.differentiate(at.projection, M, derivative.M(i), derivative.A(i), derivative.b(i), view.quantity->parts());
-    view.quantity->differentiate(at, motion.linear(), dmotion.linear(), dA, all.G, workspace);
-    view.quantity->differentiate(at, motion.constant(), dmotion.constant(), dA, all.d, workspace);
-    return all;
+    VectorXd db = derivative.b(i);
+    if (G == nullptr) db.setZero();
+    motion.evaluate(projection, M, view.quantity->parts());
+    dmotion.differentiate(projection, M, derivative.M(i), derivative.A(i), db, view.quantity->parts());
+    if (G != nullptr) view.quantity->differentiate(at, motion.linear(), dmotion.linear(), dA, *G, workspace);
+    view.quantity->differentiate(at, motion.constant(), dmotion.constant(), dA, d, workspace);
   });
-  const VectorXd db = VectorXd::Zero(mechanics.constraint_noise.size());
-  out.slip = Slip(view, mechanics).collect(all.d.rows(), [&](int i, const UdwadiaKalaba& unit, MatrixXd& d) {
-    const auto M = mechanics.values.M(i);
-    motion.evaluate(unit, M, view.quantity->parts());
-    dmotion.differentiate(unit, M, derivative.M(i), derivative.A(i), db, view.quantity->parts());
-    view.quantity->differentiate({unit, mechanics.values.A(i), view.required_time_step()}, motion.constant(), dmotion.constant(),
-                                 ParameterChange(derivative.A(i)), d, workspace);
-  });
-  return out;
 }
 
 }  // namespace gp2

@@ -167,7 +167,7 @@ DrivenMotion generate_motion(const Model& model, int n, RandomStream& random) {
   step.max_steps = 20'000;  // from one sample to the next
   step.max_steps_advice =
       "[truth] is stiff there, or the controller needs very large forces (a target that cannot be reached from this posture): "
-      "choose other targets of [motion], longer segments, or a smoother [truth]";
+      "choose other targets of [motion], longer segments, a higher rate, or a smoother [truth]";
   DrivenMotion motion{MatrixXd(layout.size(), n), MatrixXd(layout.nq, n)};
   for (int i = 0; i < n; ++i) {
     state[layout.t()] = i / model.motion->rate;

@@ -64,16 +64,11 @@ std::vector<int> others(int n, const std::vector<int>& some) {
   return out;
 }
 
-std::vector<int> joined(std::vector<int> some, const std::vector<int>& more) {
-  some.insert(some.end(), more.begin(), more.end());
-  return some;
-}
-
-std::vector<int> read_positions(const System& system, std::vector<int> among) {
+std::vector<int> positions_that(bool are_read, const System& system, std::vector<int> among) {
   std::erase_if(among, [&](int j) {
     const auto entry = static_cast<std::size_t>(system.layout().q(j));
     const auto is_read = [&](SystemPart part) -> bool { return system.reads(part)[entry]; };
-    return !is_read(SystemPart::mechanics) && !is_read(SystemPart::force) && !is_read(SystemPart::residuals);
+    return are_read != (is_read(SystemPart::mechanics) || is_read(SystemPart::force) || is_read(SystemPart::residuals));
   });
   return among;
 }
@@ -88,8 +83,8 @@ ConstrainedStates::ConstrainedStates(const Model& model, std::vector<int> measur
       parameters_(model.system->parameter_values()),
       measured_(std::move(measured)),
       free_(others(system_.nq(), measured_)),
-      seen_(read_positions(system_, free_)),
-      blind_(others(system_.nq(), joined(measured_, seen_))),
+      seen_(positions_that(true, system_, free_)),
+      blind_(positions_that(false, system_, free_)),
       held_(held_entries(system_, measured_, blind_)),
       projection_(system_, parameters_, held_) {
   for (std::size_t k = 0; k < system_.residual_labels().size(); ++k) {
@@ -206,15 +201,16 @@ ConstrainedStates::Linearisation ConstrainedStates::linearise(const VectorXd& st
 
 namespace {
 
+// (q, dq, ddq) of a coordinate, in z
+auto entries_of(int coordinate, Index nq) { return Eigen::seqN(coordinate, 3, nq); }
+
 // W, so that measured entries of z are ẑ + W w, w ~ N(0, I)
 MatrixXd root_of(const std::vector<Eigen::Matrix3d>& covariance, const std::vector<int>& measured, Index nq) {
   const Index n_measured = static_cast<Index>(measured.size());
   MatrixXd W = MatrixXd::Zero(3 * nq, 3 * n_measured);
   for (Index k = 0; k < n_measured; ++k) {
     const Eigen::Matrix3d root = covariance[static_cast<std::size_t>(k)].llt().matrixL();
-    for (Index a = 0; a < 3; ++a) {
-      for (Index b = 0; b <= a; ++b) W(a * nq + measured[static_cast<std::size_t>(k)], 3 * k + b) = root(a, b);
-    }
+    W(entries_of(measured[static_cast<std::size_t>(k)], nq), Eigen::seqN(3 * k, 3)) = root;
   }
   return W;
 }
@@ -234,9 +230,7 @@ std::vector<Index> unknown_entries(const std::vector<int>& free, const std::vect
 VectorXd offset_of_measured(const std::vector<int>& measured, const VectorXd& estimate, const VectorXd& z) {
   const Index nq = z.size() / 3;
   VectorXd known_off = VectorXd::Zero(3 * nq);
-  for (Index a = 0; a < 3; ++a) {
-    for (const int j : measured) known_off[a * nq + j] = estimate[a * nq + j] - z[a * nq + j];
-  }
+  for (const int j : measured) known_off(entries_of(j, nq)) = (estimate - z)(entries_of(j, nq));
   return known_off;
 }
 
@@ -286,11 +280,7 @@ void condition_covariance(const ConditionedStep& at, const MatrixXd& W, const st
   MatrixXd kept = MatrixXd::Identity(W.cols(), W.cols());
   if (at.B.rows() > 0) kept -= at.constraints.pseudoInverse() * at.B;
   const MatrixXd all = W * kept * W.transpose();
-  for (std::size_t k = 0; k < measured.size(); ++k) {
-    for (Index a = 0; a < 3; ++a) {
-      for (Index b = 0; b < 3; ++b) covariance[k](a, b) = all(a * nq + measured[k], b * nq + measured[k]);
-    }
-  }
+  for (std::size_t k = 0; k < measured.size(); ++k) covariance[k] = all(entries_of(measured[k], nq), entries_of(measured[k], nq));
 }
 
 }  // namespace

@@ -530,16 +530,10 @@ SmootherFit fit_smoother(std::vector<Measurement> measurements, const SmootherFi
     if (!changed) break;
   }
   fit.outliers.clear();
-  std::size_t n_trusted = 0;
   for (std::size_t k = 0; k < measurements.size(); ++k) {
-    if (trust.used()[k]) {
-      measurements[n_trusted++] = measurements[k];
-    } else {
-      fit.outliers.push_back(static_cast<int>(k));
-    }
+    if (!trust.used()[k]) fit.outliers.push_back(static_cast<int>(k));
   }
-  measurements.resize(n_trusted);
-  fit.trusted = std::move(measurements);
+  fit.trusted = those_used(measurements, trust.used());
   return fit;
 }
 

@@ -5,7 +5,6 @@
 
 #include <Eigen/Cholesky>
 #include <Eigen/Core>
-#include <Eigen/QR>
 #include <boost/math/quadrature/gauss.hpp>
 
 namespace gp2 {

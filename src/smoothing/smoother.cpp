@@ -2,10 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
-#include <functional>
-#include <limits>
 #include <numbers>
-#include <numeric>
 
 #include <fmt/format.h>
 
@@ -16,7 +13,6 @@
 namespace gp2 {
 
 using Eigen::Index;
-using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 namespace {
@@ -39,18 +35,16 @@ Timeline timeline_of(const std::vector<Measurement>& measurements, const Eigen::
   // stamps of one clock differ in their last digits
   constexpr double same_interval = 1e-9;
   Timeline line;
+  std::vector<double> all(times.begin(), times.end());
+  for (const Measurement& one : measurements) all.push_back(one.time);
+  std::sort(all.begin(), all.end());
+  all.erase(std::unique(all.begin(), all.end()), all.end());
   int measurement = 0;
-  Index further = 0;
-  const int n_measurements = static_cast<int>(measurements.size());
-  while (measurement < n_measurements || further < times.size()) {
-    const double measured_at = measurement < n_measurements ? measurements[static_cast<std::size_t>(measurement)].time
-                                                            : std::numeric_limits<double>::infinity();
-    const double asked_at = further < times.size() ? times[further] : std::numeric_limits<double>::infinity();
-    Timeline::Moment moment{std::min(measured_at, asked_at), -1, measurement, measurement};
-    while (measurement < n_measurements && measurements[static_cast<std::size_t>(measurement)].time <= moment.time) ++measurement;
-    while (further < times.size() && times[further] <= moment.time) ++further;
-    moment.last = measurement;
-    line.moments.push_back(moment);
+  for (const double time : all) {
+    const int first = measurement;
+    while (measurement < std::ssize(measurements) && measurements[static_cast<std::size_t>(measurement)].time <= time)
+      ++measurement;
+    line.moments.push_back({time, -1, first, measurement});
   }
 
   std::vector<std::pair<double, std::size_t>> steps;
@@ -168,28 +162,6 @@ class Filter {
     Vector mean;
     Matrix root;
   };
-  /// A belief without the zeros of its root.
-  struct Stored {
-    Vector mean;
-    Eigen::Matrix<double, D*(D + 1) / 2, 1> root;
-
-    static Stored of(const Belief& belief) {
-      Stored out{belief.mean, {}};
-      int next = 0;
-      for (int j = 0; j < D; ++j) {
-        for (int i = j; i < D; ++i) out.root[next++] = belief.root(i, j);
-      }
-      return out;
-    }
-    [[nodiscard]] Belief belief() const {
-      Belief out{mean, Matrix::Zero()};
-      int next = 0;
-      for (int j = 0; j < D; ++j) {
-        for (int i = j; i < D; ++i) out.root(i, j) = root[next++];
-      }
-      return out;
-    }
-  };
   /// What a measurement did.
   struct Update {
     int derivative = 0;  // 0: of q, 1: of dq
@@ -234,7 +206,7 @@ class Filter {
         belief.root = triangular_root<D, 2 * D>(columns);
         belief.mean = (step.transition * belief.mean).eval();
       }
-      predicted_.push_back(Stored::of(belief));
+      predicted_.push_back(belief);
       for (int m = moment.first; m < moment.last; ++m)
         updates_.push_back(take_in(measurements_[static_cast<std::size_t>(m)], belief));
     }
@@ -256,9 +228,9 @@ class Filter {
   }
 
   // what is believed of a moment before its measurements, and after: less to find again than to keep
-  [[nodiscard]] Belief predicted(std::size_t k) {
+  [[nodiscard]] const Belief& predicted(std::size_t k) {
     require_block_of(k);
-    return predicted_[k - first_].belief();
+    return predicted_[k - first_];
   }
   [[nodiscard]] Belief updated(std::size_t k) {
     Belief belief = predicted(k);
@@ -304,7 +276,7 @@ class Filter {
   std::vector<KeptStep> steps_;
   std::vector<Belief> begins_;     // of each block: after the moment before it
   std::size_t first_ = 0;          // moment of the block that is kept
-  std::vector<Stored> predicted_;  // at each of its moments, before its measurements
+  std::vector<Belief> predicted_;  // at each of its moments, before its measurements
   std::vector<Update> updates_;    // by each of its measurements
   double log_likelihood_ = 0;
 };

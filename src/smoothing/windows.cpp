@@ -164,14 +164,10 @@ NoiseWeights weights_of_errors(const Samples& samples, const WindowGrid& grid, c
     const auto first = std::upper_bound(samples.time.begin(), samples.time.end(), from);
     return std::pair(first - samples.time.begin(), std::lower_bound(first, samples.time.end(), to) - samples.time.begin());
   };
-  const auto has_weight = [](double one) { return one != 0; };
-  const auto first_state = std::find_if(weights.begin(), weights.end(), has_weight) - weights.begin();
-  Index last_state = weights.size() - 1;
-  while (last_state > first_state && weights[last_state] == 0) --last_state;
-  const auto [begin, end] = range_of(times[first_state] - 2 * knots, times[last_state] + 2 * knots);
+  const auto [begin, end] = range_of(times[0] - 2 * knots, times[times.size() - 1] + 2 * knots);
   NoiseWeights out{begin, MatrixXd::Zero(end - begin, grid.sensitivity.by_position.cols())};
   const StateSensitivity& sensitivity = grid.sensitivity;
-  for (Index i = first_state; i <= last_state; ++i) {
+  for (Index i = 0; i < times.size(); ++i) {
     const Index row = std::lower_bound(sensitivity.times.begin(), sensitivity.times.end(), times[i]) - sensitivity.times.begin();
     const auto [from, to] = range_of(times[i] - 2 * knots, times[i] + 2 * knots);
     for (Index k = from; k < to; ++k) {
@@ -244,7 +240,7 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
     const double origin = samples.value[static_cast<std::size_t>(window.first)];
     for (Index i = 0; i < c.size(); ++i)
       sum.value += c[i] * (samples.value[static_cast<std::size_t>(window.first - 1 + i)] - origin);
-    noise.push_back(noise_weights(samples, grid, window, c, times, weights));
+    noise.push_back(noise_weights(samples, grid, window, c, times.segment(from, to - from), sum.weights));
   }
   const MatrixXd covariance = covariance_of(samples, noise);
   const Eigen::LLT<MatrixXd> factor(covariance);

@@ -15,6 +15,14 @@ using Eigen::VectorXd;
 
 namespace {
 
+VectorXd parameters_under(const Prior& prior, const std::vector<Hyperparameter>& hyperparameters) {
+  VectorXd parameters = prior.system->parameter_values();
+  for (const Hyperparameter& h : hyperparameters) {
+    if (h.is_system_parameter()) parameters[h.index] = h.value;
+  }
+  return parameters;
+}
+
 // The states of the observations of the prior's own system, by group.
 std::vector<const Observations*> of_fitted_system(const std::vector<Observations>& observations) {
   std::vector<const Observations*> groups;
@@ -121,16 +129,13 @@ LeastSquares solve(const Prior& prior, const std::vector<const Observations*>& g
 void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& observations,
                         std::vector<Hyperparameter>& hyperparameters) {
   const std::vector<const Observations*> groups = of_fitted_system(observations);
-  VectorXd parameters = prior.system->parameter_values();
+  const VectorXd parameters = parameters_under(prior, hyperparameters);
   std::vector<Hyperparameter*> silent;  // the accelerations say nothing of them
   std::vector<int> indices;             // of all that are estimated
   for (Hyperparameter& h : hyperparameters) {
-    if (!h.is_system_parameter()) continue;
-    parameters[h.index] = h.value;
-    if (!h.is_fixed()) indices.push_back(h.index);
-  }
-  for (Hyperparameter& h : hyperparameters) {
-    if (h.is_system_parameter() && !h.is_fixed() && !moves_the_system(prior, groups, parameters, h.index)) silent.push_back(&h);
+    if (!h.is_system_parameter() || h.is_fixed()) continue;
+    indices.push_back(h.index);
+    if (!moves_the_system(prior, groups, parameters, h.index)) silent.push_back(&h);
   }
   if (silent.empty() || groups.empty()) return;
   const bool has_residuals = !prior.system->residual_labels().empty();
@@ -170,10 +175,7 @@ bool has_one_constraint(const System& system, const MatrixXd& states, const Vect
 
 std::vector<bool> held_in_draws(const Prior& prior, const std::vector<Observations>& observations,
                                 const std::vector<Hyperparameter>& hyperparameters) {
-  VectorXd parameters = prior.system->parameter_values();
-  for (const Hyperparameter& h : hyperparameters) {
-    if (h.is_system_parameter()) parameters[h.index] = h.value;
-  }
+  const VectorXd parameters = parameters_under(prior, hyperparameters);
   const std::vector<const Observations*> of_fitted = of_fitted_system(observations);
   std::vector<bool> held(hyperparameters.size());
   for (std::size_t k = 0; k < held.size(); ++k) {

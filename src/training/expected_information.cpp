@@ -7,7 +7,6 @@
 #include <Eigen/Cholesky>
 
 #include "base/lapack.hpp"
-#include "base/parallel.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "training/curvature.hpp"
 

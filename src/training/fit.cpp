@@ -8,7 +8,6 @@
 #include "base/parallel.hpp"
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
-#include "inference/posterior_implementation.hpp"
 #include "inference/requirements.hpp"
 #include "training/hamiltonian.hpp"
 #include "training/optimum.hpp"
@@ -82,9 +81,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   }
   FitReport report = [&] {
     if (options.n_inducing > 0) return trained_through_points(prior, observations, hyperparameters, options);
-    const std::vector<Observations> part = is_part ? evenly(observations, options.n_train) : std::vector<Observations>();
-    const std::vector<Observations>& of = is_part ? part : observations;
-    return trained_exactly(prior, of, hyperparameters, options);
+    return trained_exactly(prior, is_part ? evenly(observations, options.n_train) : observations, hyperparameters, options);
   }();
   const Workers workers(thread_count(options.n_threads), options.ranks);
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws

@@ -5,8 +5,6 @@
 #include <limits>
 #include <mutex>
 #include <numbers>
-#include <numeric>
-#include <optional>
 #include <span>
 
 #include <Eigen/Eigenvalues>
@@ -218,37 +216,12 @@ VectorXd HamiltonianDraws::effective_size() const {
 
 namespace {
 
-struct Steps {
-  std::vector<VectorXd> x;
-  std::vector<double> objective;
-  double acceptance = 0;  // sum
-  int evaluations = 0;
-
-  Steps() = default;
-  /// As print() has them.
-  Steps(const Eigen::Ref<const VectorXd>& numbers, Index n_x)
-      : acceptance(numbers[1]), evaluations(static_cast<int>(numbers[2])) {
-    Index at = 3;
-    for (auto n = static_cast<int>(numbers[0]); n > 0; --n, at += n_x + 1) {
-      x.emplace_back(numbers.segment(at, n_x));
-      objective.push_back(numbers[at + n_x]);
-    }
-  }
-  void print(std::span<double> numbers) const {
-    std::fill(numbers.begin(), numbers.end(), 0.0);
-    numbers[0] = static_cast<double>(x.size()), numbers[1] = acceptance, numbers[2] = evaluations;
-    auto out = numbers.begin() + 3;
-    for (std::size_t s = 0; s < x.size(); ++s) {
-      out = std::copy(x[s].begin(), x[s].end(), out);
-      *out++ = objective[s];
-    }
-  }
-};
-
 // what progress(evaluations since) hears of
+// @param out  how many steps are kept, the sum of their acceptances, the evaluations, and of each step x and the objective
 template <typename Tell>
-Steps run_chain(Chain& chain, int max_evaluations, const std::atomic<bool>* stop, const Tell& progress) {
-  Steps kept;
+void run_chain(Chain& chain, int max_evaluations, const std::atomic<bool>* stop, const Tell& progress, std::span<double> out) {
+  std::ranges::fill(out, 0.0);
+  auto next = out.begin() + 3;
   bool adapting = true;
   while (chain.evaluations() + Chain::longest <= max_evaluations && !is_set(stop)) {
     const int before = chain.evaluations();
@@ -260,14 +233,14 @@ Steps run_chain(Chain& chain, int max_evaluations, const std::atomic<bool>* stop
     if (adapting) {
       chain.length().adapt(probability);
     } else {
-      kept.x.push_back(chain.x());
-      kept.objective.push_back(chain.objective());
-      kept.acceptance += probability;
+      ++out[0];
+      out[1] += probability;
+      next = std::copy(chain.x().begin(), chain.x().end(), next);
+      *next++ = chain.objective();
     }
     progress(chain.evaluations() - before);
   }
-  kept.evaluations = chain.evaluations();
-  return kept;
+  out[2] = chain.evaluations();
 }
 
 }  // namespace
@@ -283,33 +256,27 @@ HamiltonianDraws draw_coordinates(const Objective& objective, const std::vector<
   };
   const int of_chain = options.max_evaluations / static_cast<int>(starts.size());
   const Index n_x = lower.size();
-  // of each chain: steps kept, acceptance, evaluations, and of each step x and the objective; a step takes an evaluation or more
+  // a step takes an evaluation or more
   MatrixXd numbers(3 + of_chain * (n_x + 1), std::ssize(starts));
   share_out({numbers.data(), static_cast<std::size_t>(numbers.size())}, static_cast<int>(starts.size()),
             options.evaluators.side_by_side, [&](int c, std::span<double> column) {
               const auto own = static_cast<std::size_t>(c);
               Chain chain(objective, starts[own], lower, upper, RandomStream(options.seed, own), options.evaluators.within(),
                           options.stop);
-              run_chain(chain, of_chain, options.stop, progress).print(column);
+              run_chain(chain, of_chain, options.stop, progress, column);
             });
-  std::vector<Steps> kept;
-  for (const auto& column : numbers.colwise()) kept.emplace_back(column, n_x);
   if (is_set(options.stop)) throw NumericalError("stopped before all hyperparameters were drawn");
 
   // as many of each chain, the last ones
-  std::size_t n = kept.front().x.size(), n_all = 0;
-  for (const Steps& of_one : kept) n = std::min(n, of_one.x.size()), n_all += of_one.x.size();
+  const auto n = static_cast<Index>(numbers.row(0).minCoeff());
   HamiltonianDraws out;
-  for (const Steps& of_one : kept) {
-    MatrixXd& x = out.chains.emplace_back(lower.size(), static_cast<Index>(n));
-    VectorXd& J = out.objective.emplace_back(static_cast<Index>(n));
-    for (std::size_t s = 0; s < n; ++s) {
-      const std::size_t from = of_one.x.size() - n + s;
-      x.col(static_cast<Index>(s)) = of_one.x[from];
-      J[static_cast<Index>(s)] = of_one.objective[from];
-    }
-    out.acceptance += of_one.acceptance / static_cast<double>(n_all);
-    out.evaluations += of_one.evaluations;
+  for (const auto& column : numbers.colwise()) {
+    const auto n_kept = static_cast<Index>(column[0]);
+    const MatrixXd steps = column.segment(3, n_kept * (n_x + 1)).reshaped(n_x + 1, n_kept).rightCols(n);
+    out.chains.emplace_back(steps.topRows(n_x));
+    out.objective.emplace_back(steps.row(n_x).transpose());
+    out.acceptance += column[1] / numbers.row(0).sum();
+    out.evaluations += static_cast<int>(column[2]);
   }
   return out;
 }

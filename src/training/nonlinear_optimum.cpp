@@ -4,8 +4,6 @@
 #include <optional>
 #include <utility>
 
-#include <fmt/format.h>
-
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "inference/posterior_implementation.hpp"

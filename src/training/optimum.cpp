@@ -107,19 +107,32 @@ class Training {
       store(static_cast<std::size_t>(restart), results[static_cast<std::size_t>(restart)]);
     }
     release();
-    while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
+    while (report_.n_escapes < options_.max_escapes && !stopped() && escape()) ++report_.n_escapes;
     if (options_.standard_errors && options_.max_iterations > 0 && !stopped() && estimates_parameters()) estimate_errors();
     if (options_.n_draws > 0 && options_.max_iterations > 0 && !stopped()) draw_from_posterior();
   }
 
-  // the lowest objective; of equal ones the first
-  [[nodiscard]] std::size_t best() const {
-    return static_cast<std::size_t>(std::min_element(reports_.begin(), reports_.end(),
-                                                     [](const auto& a, const auto& b) { return a.objective < b.objective; }) -
-                                    reports_.begin());
+  /// @throws NumericalError where no restart reached a finite likelihood.
+  [[nodiscard]] FitReport report() const {
+    FitReport report = report_;
+    const std::size_t best = this->best();
+    const RestartReport& winner = reports_[best];
+    if (!std::isfinite(winner.objective)) {
+      if (stopped()) throw NumericalError("stopped before the likelihood was evaluated once: there is no fit");
+      throw NumericalError("no restart reached a finite likelihood: check the bounds of the estimated parameters and the noise");
+    }
+    report.hyperparameters = results_[best];
+    report.negative_log_likelihood = winner.negative_log_likelihood;
+    report.objective = winner.objective;
+    // the best so far may have converged, but not all that was asked for was tried
+    const bool interrupted = stopped();
+    report.converged = winner.converged && !interrupted;
+    report.termination = interrupted ? FitReport::interrupted : winner.termination;
+    report.iterations = winner.iterations;
+    report.best_restart = static_cast<int>(best);
+    report.restarts = reports_;
+    return report;
   }
-  [[nodiscard]] const std::vector<RestartReport>& reports() const { return reports_; }
-  [[nodiscard]] const std::vector<Hyperparameter>& result(std::size_t restart) const { return results_[restart]; }
   // results of finite objectives, the best first
   [[nodiscard]] std::vector<std::vector<Hyperparameter>> optima() const {
     std::vector<std::size_t> order(reports_.size());
@@ -131,13 +144,15 @@ class Training {
     }
     return optima;
   }
-  [[nodiscard]] int n_escapes() const { return n_escapes_; }
-  [[nodiscard]] const std::optional<LaplaceUncertainty>& uncertainty() const { return uncertainty_; }
-  [[nodiscard]] const std::optional<HyperparameterDraws>& draws() const { return draws_; }
-
-  [[nodiscard]] bool stopped() const { return is_set(options_.stop); }
 
  private:
+  [[nodiscard]] bool stopped() const { return is_set(options_.stop); }
+
+  // the lowest objective; of equal ones the first
+  [[nodiscard]] std::size_t best() const {
+    return static_cast<std::size_t>(std::ranges::min_element(reports_, {}, &RestartReport::objective) - reports_.begin());
+  }
+
   [[nodiscard]] bool estimates_parameters() const {
     return std::any_of(hyperparameters_.begin(), hyperparameters_.end(), [](const auto& h) { return h.is_system_parameter(); });
   }
@@ -216,7 +231,7 @@ class Training {
     HamiltonianOptions options{.seed = options_.seed, .evaluators = evaluators_, .stop = options_.stop};
     options.progress = [&](double fraction) { report_drawing(fraction); };
     try {
-      draws_ = draw_about(objective_, optima, held, options_.n_draws, options);
+      report_.draws = draw_about(objective_, optima, held, options_.n_draws, options);
     } catch (const NumericalError& error) {
       // the fit stands, and says why it has none
       reports_[best()].termination += fmt::format("; {}", error.what());
@@ -251,7 +266,7 @@ class Training {
         const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
         if (curvature.distance_from_optimum() <= near || !may_go_on) {
           const bool has_bounded = std::ranges::any_of(at, [](const auto& h) { return h.is_system_parameter() && h.at_bound(); });
-          uncertainty_ = laplace_uncertainty(
+          report_.uncertainty = laplace_uncertainty(
               has_bounded ? curvature_at(objective_, coordinates(at), at, evaluators_, options_.stop, AtBound::free_if_open)
                           : curvature,
               at);
@@ -276,7 +291,7 @@ class Training {
   void restore_undetermined(std::size_t from, Likelihood::Workspace& workspace) {
     std::vector<Hyperparameter> restored = results_[from];
     for (std::size_t k = 0; k < restored.size(); ++k) {
-      if (restored[k].is_system_parameter() && std::isinf(uncertainty_->stddev[static_cast<Index>(k)])) {
+      if (restored[k].is_system_parameter() && std::isinf(report_.uncertainty->stddev[static_cast<Index>(k)])) {
         restored[k].value = hyperparameters_[k].value;
       }
     }
@@ -428,9 +443,7 @@ class Training {
   int n_own_ = 0;  // restarts of this process
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
-  int n_escapes_ = 0;
-  std::optional<LaplaceUncertainty> uncertainty_;
-  std::optional<HyperparameterDraws> draws_;
+  FitReport report_;  // uncertainty, draws and escapes
 
   std::mutex mutex_;  // guards what follows
   std::vector<double> fractions_;
@@ -446,27 +459,8 @@ FitReport trained(const Prior& prior, const std::vector<Observations>& observati
                   std::vector<std::vector<Hyperparameter>>* optima) {
   Training training(prior, observations, hyperparameters, options, std::move(approximation));
   training.run();
-  const std::size_t best = training.best();
-  const RestartReport& winner = training.reports()[best];
-  if (!std::isfinite(winner.objective)) {
-    if (training.stopped()) throw NumericalError("stopped before the likelihood was evaluated once: there is no fit");
-    throw NumericalError("no restart reached a finite likelihood: check the bounds of the estimated parameters and the noise");
-  }
+  FitReport report = training.report();
   if (optima != nullptr) *optima = training.optima();
-  FitReport report;
-  report.hyperparameters = training.result(best);
-  report.negative_log_likelihood = winner.negative_log_likelihood;
-  report.objective = winner.objective;
-  // the best so far may have converged, but not all that was asked for was tried
-  const bool interrupted = training.stopped();
-  report.converged = winner.converged && !interrupted;
-  report.termination = interrupted ? FitReport::interrupted : winner.termination;
-  report.iterations = winner.iterations;
-  report.best_restart = static_cast<int>(best);
-  report.n_escapes = training.n_escapes();
-  report.uncertainty = training.uncertainty();
-  report.draws = training.draws();
-  report.restarts = training.reports();
   return report;
 }
 

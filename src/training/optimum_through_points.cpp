@@ -47,9 +47,7 @@ class TrainingThroughPoints {
       const bool is_last = stage + 1 == stages.size(), is_exact = stages[stage] <= n_exact && stages[stage] < n_all;
       FitOptions options = of_stage(stage, n_stages, stages[stage]);
       options.standard_errors = options.standard_errors && is_last;
-      const std::vector<Observations> some =
-          stages[stage] < n_all ? evenly(observations_, stages[stage]) : std::vector<Observations>();
-      const std::vector<Observations>& of_stage = stages[stage] < n_all ? some : observations_;
+      const std::vector<Observations> of_stage = stages[stage] < n_all ? evenly(observations_, stages[stage]) : observations_;
       std::optional<FitReport> best;
       const auto try_from = [&](const std::vector<Hyperparameter>& start, bool may_fail) {
         if (best && is_set(options_.stop)) return;

@@ -15,16 +15,9 @@ using Eigen::VectorXd;
 
 namespace {
 
-MatrixXd side_by_side(const std::vector<MatrixXd>& parts) {
-  Index n = 0;
-  for (const MatrixXd& part : parts) n += part.cols();
-  MatrixXd all(parts.front().rows(), n);
-  Index first = 0;
-  for (const MatrixXd& part : parts) {
-    all.middleCols(first, part.cols()) = part;
-    first += part.cols();
-  }
-  return all;
+void append_columns(const MatrixXd& more, MatrixXd& all) {
+  all.conservativeResize(more.rows(), all.cols() + more.cols());
+  all.rightCols(more.cols()) = more;
 }
 
 // a spread that bounds and starting points can be multiples of, even where the data do not vary; a smaller one has no square, and
@@ -95,26 +88,21 @@ PooledStates pooled_states(const Prior& prior, const std::vector<Observations>& 
   constexpr int enough = 10'000;  // states, evenly taken, for spreads and medians
   const std::vector<Observations> observations = n_states(all) > enough ? evenly(all, enough) : all;
   const System& system = *prior.system;
-  std::vector<std::vector<MatrixXd>> features(prior.latents.size()), directions(prior.latents.size());
+  PooledStates pooled{std::vector<MatrixXd>(prior.latents.size()), std::vector<MatrixXd>(prior.latents.size()), {}};
   std::vector<std::vector<double>> mass(static_cast<std::size_t>(system.nq()));
   for (const Observations& group : observations) {
     const Prior& there = prior_of(prior, group.view());
     const VectorXd parameters = parameters_of(group.view(), system.parameter_values());
     const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), parameters);
-    PriorValues values = require_prior_values(there, group.states(), parameters, mechanics);
+    const PriorValues values = require_prior_values(there, group.states(), parameters, mechanics);
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-      features[a].push_back(evaluate_features(there, a, group.states()).transpose());
-      directions[a].push_back(std::move(values.directions[a]));
+      append_columns(evaluate_features(there, a, group.states()).transpose(), pooled.features[a]);
+      append_columns(values.directions[a], pooled.directions[a]);
     }
     for (std::size_t j = 0; j < mass.size(); ++j) {
       const auto row = static_cast<Index>(j);
       for (const UdwadiaKalaba& projection : mechanics.projections) mass[j].push_back(projection.mass()(row, row));
     }
-  }
-  PooledStates pooled;
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    pooled.features.push_back(side_by_side(features[a]));
-    pooled.directions.push_back(side_by_side(directions[a]));
   }
   pooled.mass_diagonal.resize(system.nq());
   for (std::size_t j = 0; j < mass.size(); ++j) pooled.mass_diagonal[static_cast<Index>(j)] = median(std::move(mass[j]));

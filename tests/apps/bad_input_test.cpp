@@ -168,7 +168,7 @@ const std::vector<BadInput> bad_inputs = {
                   "coordinates = [\"x\"]\ninputs = [\"force_x\"]\n[mechanics]\nmass = [[1]]\nforce = [\"force_x\"]\n");
      },
      "gp2 check model.toml",
-     {"model.toml:1: coordinates: the column force_x would be a name of this model and what logs and predictions call a quantity "
+     {"model.toml:2: inputs: the column force_x would be a name of this model and what logs and predictions call a quantity "
       "of 'x'"}},
     {"GenerateInfiniteNoise",
      nothing,

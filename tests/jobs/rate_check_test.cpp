@@ -496,7 +496,14 @@ TEST(PileUp, OfAVelocityIsToldWhereTheSystemIsAccelerated) {
   EXPECT_THAT(clipped_velocity("dx", clipped, ddx).value_or(""),
               testing::AllOf(testing::StartsWith("dx is exactly 0.7, its extreme, in "), HasSubstr("the end of its range?")));
   EXPECT_EQ(clipped_velocity("dx", dx, ddx), std::nullopt);
-  EXPECT_EQ(clipped_velocity("dx", clipped, (dx.array() < 0.7).select(ddx, 0)), std::nullopt) << "a drive's constant speed";
+  RowVectorXd of_drive = (dx.array() < 0.7).select(ddx, 0);
+  EXPECT_EQ(clipped_velocity("dx", clipped, of_drive), std::nullopt) << "a drive's constant speed";
+  std::mt19937 random(5);
+  std::normal_distribution<double> noise(0, 0.2);
+  for (double& one : of_drive) one += noise(random);
+  EXPECT_EQ(clipped_velocity("dx", clipped, of_drive), std::nullopt) << "with noise";
+  for (double& one : ddx) one += noise(random);
+  EXPECT_NE(clipped_velocity("dx", clipped, ddx), std::nullopt) << "clipped, with noise";
 }
 
 TEST(FarValues, AreThoseFarBeyondAllOthers) {

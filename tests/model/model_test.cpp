@@ -673,7 +673,10 @@ std::vector<Complaint> complaints() {
       {"ColumnTwice", base + "[columns]\nq1 = \"x\"\nq2 = \"x\"\n", "9: columns.q2: the column 'x' is another name's already"},
       {"ColumnOfAnotherName", base + "[columns]\nq1 = \"q1\"\nq2 = \"dq1\"\n",
        "9: columns.q2: the column 'dq1' has the name of another quantity of this model, and in files that gp2 writes it is that "
-       "quantity: leave this out, and read logs that are like this with `map=dq1=q2`"},
+       "quantity: leave this out"},
+      {"ColumnsExchanged", base + "[columns]\nq1 = \"q2\"\nq2 = \"q1\"\n",
+       "8: columns.q1: the column 'q2' has the name of another quantity of this model, and in files that gp2 writes it is that "
+       "quantity: leave this out, and read logs that are like this with `map=q2=q1,q1=q2`"},
   };
 }
 
@@ -684,8 +687,8 @@ TEST(Model, OnlyTheMultipliersOfItsRowsAreNamesOfColumns) {
   const std::string text = replaced(base, "\"u1\"", "\"lambda2\"") + "[constraints]\nposition = [\"q1 - q2\"";
   EXPECT_EQ(error_of(text + "]\n"), "");
   EXPECT_EQ(error_of(text + ", \"q1\"]\n"),
-            "m.toml:1: coordinates: the column lambda2 would be a name of this model and what logs and predictions call a "
-            "quantity of the constraints; choose another name");
+            "m.toml:2: inputs: the column lambda2 would be a name of this model and what logs and predictions call a quantity of "
+            "the constraints; choose another name");
 }
 
 TEST(Model, ARowGoesByItsName) {

@@ -279,7 +279,20 @@ def test_functions_that_return_one_array_for_all_states_are_found():
 
     joint = gp2.System.from_callables(mechanics, coordinates=["q"], reads=["q"], noise=0.1)
     states = {"q": [0.1, 0.7, 1.3], "dq": [0.0, 0.0, 0.0], "ddq": [0.0, 0.0, 0.0]}
-    assert any("differ when it is asked alone" in one.text for one in gp2.check(joint, states))
+    mixes = "differ between a call with it alone and a call with several"
+    assert any(mixes in one.text for one in gp2.check(joint, states))
+    with pytest.raises(gp2.InputError, match=f"M, A or b of one state {mixes}"):
+        gp2.fit(joint, states)
+
+
+def test_functions_whose_rounding_depends_on_the_number_of_states_do_not_mix_rows():
+    def mechanics(states, _):
+        rounding = 1e-7 if len(states) > 1 else 0.0  # sums in single precision
+        return np.full((len(states), 1, 1), 2 + rounding), None, None, np.full((len(states), 1), rounding)
+
+    joint = gp2.System.from_callables(mechanics, coordinates=["q"], reads=["q"], noise=0.1)
+    states = {"q": [0.1, 0.7, 1.3], "dq": [0.0, 0.0, 0.0], "ddq": [0.0, 0.0, 0.0]}
+    assert not any("differ between a call" in one.text for one in gp2.check(joint, states))
 
 
 def test_start_that_is_not_named_whole_is_told_of_without_residuals():
@@ -546,6 +559,11 @@ def test_functions_of_a_latent_give_the_same_fit_as_text(tmp_path):
             "'names', 'function', 'derivatives' or 'reads', got 'read'",
         ),
         ("features", {"names": ["a"], "function": features, "reads": ["y"]}, "'y' is no entry of the state"),
+        (
+            "features",
+            {"names": ["a"], "function": lambda states: states[:, :1] - states[:, :1].mean(), "reads": ["x"]},
+            "latent 'contact': features of one state differ between a call with it alone and a call with several",
+        ),
         ("directions", {"force": {"names": ["a", "b"], "function": directions, "reads": []}}, r"\(n, nq, names\) = \(40, any, 2\)"),
         (
             "directions",

@@ -239,6 +239,10 @@ TEST(Advice, JudgesTheCoverageOfTheTestByItsSize) {
   EXPECT_THAT(learning_advice(report),
               ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "the noise is stated too large.")));
   report.fit.prior_options.baseline.reset();
+  report.fit.options = R"({"protocol": "paper"})";  // alike
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "the noise is stated too large.")));
+  report.fit.options.clear();
   test.coverage95_latent = 0.95;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "free of noise")));
 }

@@ -537,7 +537,7 @@ TEST(RobotModel, SaysHowAJointIsCalledOtherwise) {
   const std::string text = fmt::format("robot = '{}'\n", path.string());
   EXPECT_EQ(test::input_error_of([&] { Model::parse(text, "arm.toml"); }),
             "arm.toml:1: robot: 'exp' is the name of a function or constant; choose another, for a joint by coordinates = "
-            "[\"q1\", …], one per joint in the order of the file");
+            "[\"q1\", …], one per coordinate, in the order of the file");
   EXPECT_NO_THROW(Model::parse(text + "coordinates = ['q1']\n", "arm.toml"));
 }
 

@@ -397,8 +397,9 @@ TEST(GenerateMotion, ATruthThatIsStiffIsRefusedSoonWithTheMend) {
     noise_free(model, 100);
     FAIL() << "20000 steps per sample were enough";
   } catch (const NumericalError& error) {
-    EXPECT_THAT(error.what(), AllOf(StartsWith("simulate: 20000 steps reach no further than t = "),
-                                    EndsWith("choose other targets of [motion], longer segments, or a smoother [truth]")));
+    EXPECT_THAT(error.what(),
+                AllOf(StartsWith("simulate: 20000 steps reach no further than t = "),
+                      EndsWith("choose other targets of [motion], longer segments, a higher rate, or a smoother [truth]")));
   }
 }
 

@@ -16,7 +16,7 @@
 namespace gp2 GP2_API {
 
 /// What inputs were told over a whole log: by episodes, and where one pauses by what lies between pauses. What acts follows from it at
-/// any time, from rest at the start of each part.
+/// any time: before a part, the first command counts as constant.
 class CommandRecord {
  public:
   /// Where a row stands.

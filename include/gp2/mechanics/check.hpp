@@ -102,6 +102,11 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
                                                      const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
                                                      const Eigen::Ref<const Eigen::MatrixXd>& stddev);
 
+/// Functions of all states at once must give each its own values: not one array for all, nor those of its neighbours.
+/// @returns which part of the system does not, as a text; nothing if all do, as expressions do
+std::optional<std::string> mixed_states(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                        const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
 /// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank, its rows
 /// neither nearly zero nor nearly redundant, b in the range of A, derivatives in the parameters equal to finite differences, A
 /// and b equal to the second derivative of the constraints along a motion. Of a system without expressions also: does it read no
