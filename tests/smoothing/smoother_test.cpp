@@ -269,7 +269,7 @@ TEST(Smoother, FindsTheNoiseWhereEveryPositionIsMeasuredTwiceAtItsTime) {
 }
 
 TEST(Smoother, TakesNoiseForNoTimingWhereASpeedIsNearlyConstant) {
-  for (const std::uint64_t seed : {1, 2, 3}) {
+  for (const std::uint64_t seed : {1U, 2U, 3U}) {
     RandomStream random(seed);
     std::vector<Measurement> measurements;
     for (int k = 0; k < 1000; ++k) {
