@@ -91,7 +91,7 @@ void print_text(const Evaluation& e) {
                  figure(part->nrmse, 4), coverages(part->coverage50, part->coverage80, part->coverage95));
   }
   print_result("points                      {}{}\n", e.n,
-               e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
+               e.n_missing > 0 ? fmt::format("   ({} values not measured or left out)", e.n_missing) : "");
 }
 
 void run(EvaluateArguments& arguments) {

@@ -487,6 +487,9 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.rmse.resize(std::ssize(rows));
   const VectorXd distance = posterior.distance_from_data(all, states, options.n_threads);
   Scores whole(e.rmse.size()), near(e.rmse.size()), far(e.rmse.size());
+  constexpr double rounding = 1e-12;
+  const VectorXd spreads = row_spread(targets);
+  const double spread = spreads.norm();
   posterior.for_each_marginal(all, states, options.n_threads, [&](Index first, const Posterior::Marginal& prediction) {
     require_not_stopped(options.stop);
     const MatrixXd stddev = prediction.stddev();
@@ -501,8 +504,8 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
           ++e.n_missing;
           continue;
         }
-        // rounding may leave a variance of 0 where the data say all
-        const bool has_variance = !decided(row, state) && stddev(row, i) > 0;
+        // where the data say all, or forces cancel, a deviation is what rounding leaves of it
+        const bool has_variance = !decided(row, state) && stddev(row, i) > rounding * std::max(spreads[k], noise(k, state));
         if (!has_variance) ++e.n_zero_variance;
         for (Scores* scores : {&whole, &part}) scores->add(k, error, stddev(row, i), noise(k, state), has_variance);
       }
@@ -515,7 +518,6 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
     add_largest(max_constraint_error(system, states_here, parameters, prediction.mean), e.max_constraint_error_fitted);
   });
   static_cast<Calibration&>(e) = whole.calibration();
-  const double spread = row_spread(targets).norm();
   e.rmse = whole.rmse();
   double normalised = 0;
   for (Index k = 0; k < e.rmse.size(); ++k) {

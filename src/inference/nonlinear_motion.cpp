@@ -175,13 +175,15 @@ void NonlinearMotion::differentiate(const Linearisation::OfGroup& at, const Syst
                                     const ViewValues& viewed, ViewValues& d_viewed, PriorValues& d_prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
   const PriorValues values = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
-  const ViewValues d_multipliers = differentiate_view(of_multipliers_, mechanics_, derivative);
+  // else friction of no load: the multipliers, which redundant rows do not determine, play no part
+  const bool is_under_load = std::ranges::any_of(prior_.latents, &Latent::reads_multipliers);
+  const ViewValues d_multipliers = is_under_load ? differentiate_view(of_multipliers_, mechanics_, derivative) : ViewValues();
   d_prior = differentiate_prior(prior_, states_, parameters_, mechanics_, values, derivative, index, &at.multipliers);
   Under under(*this, c), derivative_under(*this, c, index);
   LoadResponse response;
   for (int i = 0; i < n_states(); ++i) {
     linearise_amplitudes(at, c, i, d_prior);
-    if (at.multipliers.rows() == 0) continue;
+    if (!is_under_load) continue;
     under.move_to(i);
     derivative_under.move_to(i);
     const MatrixXd& J = under.slope(at.multipliers.col(i));

@@ -398,5 +398,28 @@ TEST_F(FitCommand, NumbersOutOfRangeAreRefused) {
   }
 }
 
+TEST(FitOfAPositiveLatent, IsTheSameWithARedundantRowWhileAParameterIsEstimated) {
+  const Desk desk;
+  const auto fitted = [&](const char* more) {
+    desk.write(
+        "carts.toml",
+        fmt::format(
+            "coordinates = [\"x\", \"y\"]\ninputs = [\"u\"]\n[parameters]\nm = {{ value = 1, bounds = [0.5, 3], estimate = true "
+            "}}\n[mechanics]\nmass = [[\"m\", \"0\"], [\"0\", \"1\"]]\nforce = [\"u\", \"0\"]\n[constraints]\nposition = "
+            "[\"y - 2*x\"{}]\n[[latent]]\nname = \"drag\"\nfeatures = [\"dx\"]\ndirections = {{ force = [[\"-dx\"], "
+            "[\"0\"]] }}\npositive = true\n[noise]\nddq = 0.05\n[truth]\nforce = [\"-0.5*dx\", \"0\"]\n[sampling]\nx = [-1, "
+            "1]\ndx = [-1, 1]\nu = [-3, 3]\ny = \"2*x\"\ndy = \"2*dx\"\n",
+            more));
+    if (!desk.has("log.csv")) desk.done("gp2 generate carts.toml --n 30 -o log.csv");
+    return desk.done("gp2 fit carts.toml --data log.csv --mean force --restarts 1 --max-iterations 4 --json -o fit.json").json();
+  };
+  const nlohmann::json plain = fitted(""), redundant = fitted(", \"2*y - 4*x\"");
+  ASSERT_EQ(plain["hyperparameters"].size(), redundant["hyperparameters"].size());
+  for (std::size_t k = 0; k < plain["hyperparameters"].size(); ++k) {
+    const double value = plain["hyperparameters"][k]["value"];
+    EXPECT_NEAR(redundant["hyperparameters"][k]["value"].get<double>(), value, 1e-6 * std::abs(value));
+  }
+}
+
 }  // namespace
 }  // namespace gp2::test

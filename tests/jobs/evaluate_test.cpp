@@ -57,9 +57,9 @@ CsvTable log_of(const std::string& name, int n, const std::string& columns, bool
   return CsvTable::parse(text, name);
 }
 
-FitOutcome fit_of(std::vector<Log> logs) {
+FitOutcome fit_of(std::vector<Log> logs, Model model = sledge()) {
   FitRequest request;
-  request.model = sledge();
+  request.model = std::move(model);
   request.logs = std::move(logs);
   request.restarts = 1;
   request.max_iterations = 3;
@@ -98,6 +98,28 @@ TEST(EvaluateJob, CountsWhatTheConstraintDecidesAsDecided) {
   EXPECT_LT(straight.nlpd_latent, 50);
   const Evaluation turned = evaluate(fit.file, fit.posterior, log_of("t.csv", 8, ",ddx,ddy,ddheading", false), {}).evaluation;
   EXPECT_EQ(turned.n_zero_variance, 1) << "the first row of this log is straight";
+}
+
+TEST(EvaluateJob, CountsForcesThatCancelAsDecided) {
+  Model carts = Model::parse(
+      "coordinates = [\"x\", \"y\"]\ninputs = [\"clutch\"]\n[mechanics]\nmass = [[1, 0], [0, 2.3]]\n[constraints]\nvelocity = [{ "
+      "expr = "
+      "\"dx - dy\", when = \"clutch > 0.5\" }]\n[[latent]]\nfeatures = [\"x - y\"]\nkernel = \"se\"\ndirections = { force = "
+      "[[\"1\"], "
+      "[\"-1\"]] }\n[noise]\nddq = 0.03\n",
+      "carts.toml");
+  const auto log = [](double clutch) {
+    std::string text = "x,y,dx,dy,clutch,ddx,ddy\n";
+    for (int i = 0; i < 20; ++i) {
+      const double e = std::sin(1.7 * i);
+      text +=
+          fmt::format("{},0.3,0.2,0.2,{},{},{}\n", 0.3 + e, clutch, clutch > 0.5 ? 0 : -3 * e, clutch > 0.5 ? 0 : 3 * e / 2.3);
+    }
+    return CsvTable::parse(text, "log.csv");
+  };
+  const FitOutcome fit = fit_of({{log(0)}}, std::move(carts));
+  EXPECT_EQ(evaluate(fit.file, fit.posterior, log(0), {}).evaluation.n_zero_variance, 0);
+  EXPECT_EQ(evaluate(fit.file, fit.posterior, log(1), {}).evaluation.n_zero_variance, 40);
 }
 
 TEST(EvaluateJob, ScoresPointsNearTheDataAndFarFromThemApart) {
