@@ -175,7 +175,7 @@ void NonlinearMotion::differentiate(const Linearisation::OfGroup& at, const Syst
                                     const ViewValues& viewed, ViewValues& d_viewed, PriorValues& d_prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
   const PriorValues values = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
-  // else friction of no load: the multipliers, which redundant rows do not determine, play no part
+  // Only latents that read the multipliers depend on them; those of redundant rows have no derivative.
   const bool is_under_load = std::ranges::any_of(prior_.latents, &Latent::reads_multipliers);
   const ViewValues d_multipliers = is_under_load ? differentiate_view(of_multipliers_, mechanics_, derivative) : ViewValues();
   d_prior = differentiate_prior(prior_, states_, parameters_, mechanics_, values, derivative, index, &at.multipliers);

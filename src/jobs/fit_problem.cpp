@@ -388,7 +388,7 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
   }
 }
 
-// before any number is computed from functions that mix states
+// A likelihood of functions that mix states would be that of other states.
 void require_separate_states(const FitProblem& problem) {
   for (const Observations& group : problem.observations) {
     const Prior& there = prior_of(problem.prior, group.view());

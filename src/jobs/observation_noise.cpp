@@ -69,7 +69,7 @@ struct NoiseRule {
                     "the smallest usable value is {}",
                     source, place, stddev, name, signal, rounded_up(smallest())));
   }
-  /// @param place  as above
+  /// @param place  "data row 3: ", or nothing
   [[noreturn]] void refuse_too_large(double stddev, const std::string& place = "") const {
     throw InputError(fmt::format("{}: {}the noise standard deviation {} of {} is too large: at most {:.0e} can be computed with",
                                  source, place, stddev, name, largest_number));
